@@ -25,7 +25,7 @@ from congrasp.common import named_inputs
 from congrasp.common.config import NamedInput, RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.io.claims import Claim
-from congrasp.common.io.files import write_atomically
+from congrasp.common.io.files import check_output, write_atomically
 from congrasp.common.io.inputs import read_file
 from congrasp.common.io.locks import NoLocksError, try_lock
 from congrasp.common.io.opening import open_to_update
@@ -88,9 +88,10 @@ def create_run(
         one.
 
     Raises:
-      CongraspError: the directory already has a run, or remains of one; or the initial policy does
-        not match the run.
+      CongraspError: the directory cannot be created, already has a run or remains of one, or the
+        initial policy does not match the run.
     """
+    check_output("--run-dir", run_dir, is_folder=True)
     check_spelling(run_dir)
     if (run_dir / CONFIG_FILE).exists():
         raise CongraspError(

@@ -81,6 +81,8 @@ def _system_text(error: OSError) -> str | None:
         return "There is no folder for temporary files that can be written. Set TMPDIR to one."
     if error.errno == errno.ENOENT and not error.filename:
         return "The working folder does not exist any more. Change to another."
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return f"{error.strerror}. Raise the limit ('ulimit -n 1024'), and start again."
     if error.errno == errno.EIO:
         return "A file could not be read or written, because its disk failed. Try another path."
     return None

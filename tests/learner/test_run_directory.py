@@ -374,6 +374,29 @@ def test_a_proposed_policy_exists(tmp_path, name, has_policy):
     assert (f"--initial '{policy}'" in str(caught.value)) == has_policy
 
 
+UNUSABLE = {
+    "link to nothing": lambda path: path.symlink_to("absent/folder"),
+    "file": lambda path: path.write_text("of the user"),
+    "link to a file": lambda path: path.symlink_to(__file__),
+}
+"""What is in place of a run's folder."""
+
+
+@pytest.mark.parametrize("below", ["", "a/b"])
+@pytest.mark.parametrize("name", UNUSABLE)
+def test_a_run_dir_that_cannot_be_made_is_named(tmp_path, name, below):
+    UNUSABLE[name](tmp_path / "run")
+    with pytest.raises(CongraspError, match=r"--run-dir is .*/run"):
+        create_run(tmp_path / "run" / below, RunConfig())
+
+
+def test_a_run_dir_may_be_a_link(tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "run").symlink_to("disk")
+    create_run(tmp_path / "run", RunConfig())
+    assert open_run(tmp_path / "disk") == open_run(tmp_path / "run") == RunConfig()
+
+
 def test_a_setting_that_may_change_changes_on_resume(tmp_path):
     create_run(tmp_path, RunConfig())
     text = (tmp_path / "config.json").read_bytes()

@@ -252,6 +252,10 @@ def test_a_failed_start_does_not_wait_for_kernels_that_are_being_built(tmp_path)
             "A file could not be read or written, because its disk failed. Try another path.",
         ),
         (
+            OSError(errno.EMFILE, os.strerror(errno.EMFILE), "/data/mug.obj"),
+            "Too many open files. Raise the limit ('ulimit -n 1024'), and start again.",
+        ),
+        (
             FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp']"),
             "There is no folder for temporary files that can be written. Set TMPDIR to one.",
         ),
