@@ -36,7 +36,7 @@ ENDING = tuple(
 """Signals that stop a command: the terminal closed, Ctrl-C, and the request to end."""
 SIGNALS = "signals"
 """Name of the thread that acts on signals; it runs no native code."""
-PARENT = "CONGRASPPARENT"
+PARENT = "CONGRASP_PARENT"
 """Environment variable with the parent's process number, which makes a child end with it."""
 _POLL = 0.5
 """Time between two looks at a child, s."""
