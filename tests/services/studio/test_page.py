@@ -284,7 +284,7 @@ def test_an_import_keeps_a_mass_that_is_being_typed(
     opened: Any, site: Site, tmp_path: pathlib.Path
 ) -> None:
     (tmp_path / "mug.stl").write_bytes(b"something")
-    opened.press_sequentially("#mass", "250")
+    opened.locator("#mass").press_sequentially("250")
     opened.set_input_files("#file", tmp_path / "mug.stl")
     opened.wait_for_selector("#facts:has-text('a bit small')")
     assert opened.input_value("#mass") == "250"
