@@ -50,7 +50,7 @@ _T = TypeVar("_T")
 LIGHTEST_G = 1
 HEAVIEST_G = 5000
 LONGEST = Phases(approach=10.0, lift=0.5, hold=10.0)
-_UNCHANGED_WEIGHT = {"mass_g": 0.0, "material": ""}
+_UNCHANGED_WEIGHT: dict[str, Any] = {"mass_g": 0.0, "material": ""}
 """Leaves the mass of the object unchanged."""
 _DRAWING = "drawing"
 """Result of a job that rendered a picture or a video, in place of a motion's number."""
