@@ -25,7 +25,7 @@ from congrasp.common import named_inputs
 from congrasp.common.config import NamedInput, RunConfig, run_config_from_json, to_json
 from congrasp.common.errors import CongraspError, os_errors_as
 from congrasp.common.io.claims import Claim
-from congrasp.common.io.files import write_atomically
+from congrasp.common.io.files import check_output, write_atomically
 from congrasp.common.io.inputs import read_file
 from congrasp.common.io.locks import FIRST_READABLE, NoLocksError, try_lock
 from congrasp.common.io.opening import open_to_update
@@ -88,9 +88,10 @@ def create_run(
         one.
 
     Raises:
-      CongraspError: the directory already has a run, or remains of one; or the initial policy does
-        not match the run.
+      CongraspError: the directory cannot be created, already has a run or remains of one, or the
+        initial policy does not match the run.
     """
+    check_output("--run-dir", run_dir, is_folder=True)
     check_spelling(run_dir)
     if (run_dir / CONFIG_FILE).exists():
         raise CongraspError(
@@ -165,13 +166,20 @@ def check_config_unchanged(run_dir: pathlib.Path, kept: str) -> None:
     expected = {kept, stored} - {""}
     actual = config_checksum(read_file(run_dir / CONFIG_FILE, _MAX_CONFIG_BYTES))
     if expected and actual not in expected:
-        policy = shlex.quote(str(run_dir / POLICY_FILE))
         raise CongraspError(
             f"{run_dir / CONFIG_FILE} is damaged or was edited: its checksum is neither that of "
             f"the checkpoint nor that in {CHECKSUM_FILE}.",
             f"Restore it from a copy. To change a setting, pass it as an option with --resume, or "
-            f"start another run with --initial {policy}.",
+            f"{_another_run(run_dir)}.",
         )
+
+
+def _another_run(run_dir: pathlib.Path) -> str:
+    """Proposes another run, from the policy of this one if it has one."""
+    policy = run_dir / POLICY_FILE
+    if not policy.exists():
+        return "start another run"
+    return f"start another run with --initial {shlex.quote(str(policy))}"
 
 
 def open_run(run_dir: pathlib.Path) -> RunConfig:
@@ -301,12 +309,10 @@ def has_checkpoints(run_dir: pathlib.Path) -> bool:
     if Checkpoints(run_dir / CHECKPOINTS).files():
         return True
     if remains := _remains(run_dir):
-        policy = run_dir / POLICY_FILE
-        begin = f" with --initial {policy}" if policy.exists() else ""
         raise CongraspError(
             f"{run_dir} has no checkpoint to resume from, although {remains[0].name} shows that it "
             f"had one.",
-            f"Start again in another --run-dir{begin}.",
+            f"In another --run-dir, {_another_run(run_dir)}.",
         )
     return False
 
@@ -340,8 +346,9 @@ def continue_run(
     """
     before = open_run(run_dir)
     check_config_unchanged(run_dir, _kept_checksum(run_dir))
-    restart = f"Start another run with --initial {run_dir / POLICY_FILE}."
-    restore = f"Restore it, or start another run with --initial {run_dir / POLICY_FILE}."
+    another = _another_run(run_dir)
+    restart = f"{another[0].upper()}{another[1:]}."
+    restore = f"Restore it, or {another}."
     config = named_inputs.with_absolute_paths(config)
     inputs = _continued_inputs(before, config, restore)
     if initial is not None:

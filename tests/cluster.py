@@ -28,6 +28,8 @@ from congrasp.common.wire.codec import Message
 from congrasp.learner.hub.staleness import StalenessManager
 from congrasp.learner.hub.used_rollouts import AuditLog
 from congrasp.learner.hub.write_ahead import FOLDER, WriteAheadLog
+from congrasp.services.ops.lifetime import follow_parent
+from tests.children import following, python_path
 from tests.rollouts import FORM, bundle, learner_hub, rollout
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -190,7 +192,7 @@ class Cluster:
 
     def start(self, role, endpoint=None, **options):
         """Starts a process; options are those of its function in this file, or `clock`."""
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        environment = following(PYTHONPATH=python_path())
         arguments = {
             "folder": str(self.folder),
             "endpoint": endpoint or self.endpoint,
@@ -290,6 +292,7 @@ def assert_books_balance(final):
 
 
 if __name__ == "__main__":
+    follow_parent()
     given = json.loads(sys.argv[2])
     if given.pop("clock", "") == "jumps":
         jump_about()

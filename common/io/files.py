@@ -136,11 +136,14 @@ def user_folder(variable: str, default: str) -> pathlib.Path:
     """Returns a folder of the user, named by a variable of the XDG specification, or else the
     default in the home.
 
-    Without a home, as for a user id without an entry, it is a folder that does not exist and cannot
-    be created.
+    A relative path in the variable is ignored, as the specification says. Without a home, as for a
+    user id without an entry, it is a folder that does not exist and cannot be created.
     """
     try:
-        return pathlib.Path(os.environ.get(variable) or pathlib.Path.home() / default)
+        folder = pathlib.Path(os.environ.get(variable, "")).expanduser()
+        if folder.is_absolute():
+            return folder
+        return pathlib.Path.home() / default
     except RuntimeError:
         return pathlib.Path(os.devnull, default)
 

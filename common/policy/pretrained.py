@@ -18,6 +18,8 @@ else:
 FOLDER = pathlib.Path(__file__).with_name("data")
 """Folder of the policies of the package."""
 SUFFIX = ".safetensors"
+_WITH_REFERENCE = ("human", "allegro", "sharpa")
+"""Hands whose reference policy is part of the package."""
 
 
 def pretrained_file(hand: str) -> pathlib.Path | None:
@@ -73,10 +75,23 @@ def _packaged(name: pathlib.Path) -> pathlib.Path | None:
 
 def reference_file(hand: str) -> pathlib.Path | None:
     """Returns the file of a hand's reference policy, without reference poses and trajectories; None
-    if absent.
+    for a hand whose reference policy is not part of the package, such as a custom hand.
+
+    Raises:
+      CongraspError: the file of the package is missing.
     """
-    path = packaged_file(f"{get_hand(hand).name}-reference")
-    return path if path.exists() else None
+    spec = get_hand(hand)
+    if spec.text or spec.name not in _WITH_REFERENCE:
+        return None
+    path = packaged_file(f"{spec.name}-reference")
+    if not path.exists():
+        raise CongraspError(
+            f"{path} is missing: the policy whose grasps are the references of the hand "
+            f"'{spec.name}'.",
+            "Install congrasp again, or use constraint sets with references of your own "
+            "('congrasp constraints generate', 'congrasp evaluate --constraints').",
+        )
+    return path
 
 
 def pretrained_hands() -> list[str]:

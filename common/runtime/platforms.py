@@ -44,9 +44,11 @@ BYTES = getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 BROKEN_PIPE_CODE = 128 + getattr(signal, "SIGPIPE", 13)
 """Exit code of a command whose output is no longer read."""
 STOP_SIGNALS = tuple(
-    number for number in (signal.SIGINT, signal.SIGTERM, _SIGBREAK) if number is not None
+    number
+    for number in signal.Signals
+    if number.name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
 )
-"""Signals that stop a process."""
+"""Signals that stop a process: Ctrl-C, the request to end, and a closed terminal."""
 
 
 def signals_named(*names: str) -> tuple[signal.Signals, ...]:

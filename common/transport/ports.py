@@ -14,6 +14,10 @@ LEARNER_URL = "tcp/127.0.0.1:7447"
 """Default address of a learner: only this machine, on one port for each flow from this one on."""
 SERVER_URL = "tcp/127.0.0.1:7457"
 """Default address of a policy server."""
+LOOPBACK_REMEDY = "Start the interface, as root: ip link set lo up."
+"""Remedy for a fault of the loopback interface."""
+_LOOPBACK_S = 2.0
+"""Longest wait for a connection of this process to itself, s."""
 _URL = re.compile(r"(?P<address>[a-z]+/[^/]+):(?P<port>\d{1,5})(?P<rest>[?#].*)?")
 _FIRST_FREE_PORT = 15000
 """First port of the range for `free_port`."""
@@ -87,6 +91,28 @@ def check_ports(url: str, count: int = len(FLOWS)) -> None:
                 raise CongraspError(
                     f"Cannot listen at {url}: {reason}.", "Pass an address of this machine."
                 ) from None
+
+
+def check_loopback() -> None:
+    """Raises a CongraspError if processes of this machine cannot connect to each other."""
+    fault = loopback_fault()
+    if fault:
+        raise CongraspError(f"The loopback interface does not work: {fault}.", LOOPBACK_REMEDY)
+
+
+def loopback_fault() -> str:
+    """Returns why processes of this machine cannot connect to each other by its loopback interface,
+    as in a new network namespace; empty if they can.
+    """
+    try:
+        with socket.socket() as listener, socket.socket() as client:
+            listener.bind(("127.0.0.1", 0))
+            listener.listen(1)
+            client.settimeout(_LOOPBACK_S)
+            client.connect(listener.getsockname())
+    except OSError as error:
+        return error.strerror or str(error)
+    return ""
 
 
 def port_in_use(url: str, port: int | None = None) -> CongraspError:

@@ -3,30 +3,42 @@
 They read strangers' files, or call native code.
 
 Native code cannot be interrupted, and a few lines of a file can exceed a machine's resources.
-`python -m congrasp.services.assets.confined FUNCTION FOLDER MEMORY SECONDS PARENT` is that process:
-FUNCTION ("module:name") is called with FOLDER and the options from the standard input; what it
-returns goes to FOLDER/answer.json. It ends with the process whose id is PARENT.
+`python -m congrasp.services.assets.confined FUNCTION FOLDER MEMORY SECONDS PARENT PACKAGE ...` is
+that process: FUNCTION ("module:name") is called with FOLDER and the options from the standard
+input; its result goes to FOLDER/answer.json. It ends with the process whose id is PARENT.
 """
 
 import importlib
 import json
 import os
 import pathlib
+import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.runtime.confinement import Limits, run_confined
 from congrasp.common.runtime.environment import child_environment
-from congrasp.common.runtime.platforms import end_with, limit_this_process
+from congrasp.common.runtime.platforms import end_with, limit_this_process, signals_named
+from congrasp.services.ops import causes
 
 _ANSWER = "answer.json"
+_STARTED = "started"
+"""File that the child creates once its imports are done."""
 _MODULE = "congrasp.services.assets.confined"
+_FROM_OUTSIDE = signals_named("SIGHUP", "SIGINT", "SIGTERM")
+"""Signals by which others end a process."""
 
 
 class OutOfResources(ChildProcessError):
-    """The child reached its limit of processor time, or was killed by the system."""
+    """The child reached its limit of processor time or memory, or was killed by the system."""
+
+
+class EnvironmentFailure(ChildProcessError):
+    """The child could not do its work here, whatever the function and its input: it did not start,
+    a package cannot be imported, a file cannot be written, or another process ended it.
+    """
 
 
 def call_confined(
@@ -37,6 +49,7 @@ def call_confined(
     memory: int,
     seconds: float,
     patience: float,
+    packages: Sequence[str] = (),
 ) -> Any:
     """Calls a function of a module in a child process.
 
@@ -49,25 +62,30 @@ def call_confined(
       memory: limit of the address space, bytes.
       seconds: limit of the processor time, s.
       patience: limit of the wall-clock time, s.
+      packages: packages that the function uses, imported before it is called.
 
     Raises:
       CongraspError: of the function.
       TimeoutError: it did not end within `patience`.
-      OutOfResources: it reached its limit of processor time, or the system killed it, as it does
-        without memory.
-      ChildProcessError: it ended without an answer; the message states the reason.
+      OutOfResources: it reached its limit of processor time or memory, or the system killed it.
+      EnvironmentFailure: it did not start, or failed for a reason that is not the function's.
+      ChildProcessError: it ended without an answer; the message, a predicate, states the reason, as
+        it does for the two errors above.
     """
     env = child_environment(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", JAX_PLATFORMS="cpu")
     called = f"{function.__module__}:{function.__name__}"
-    arguments = [called, str(folder), str(memory), str(seconds), str(os.getpid())]
+    arguments = [called, str(folder), str(memory), str(seconds), str(os.getpid()), *packages]
     limits = Limits(memory=memory, processor_s=seconds, patience_s=patience)
-    child = run_confined(
-        [sys.executable, "-P", "-m", _MODULE, *arguments],
-        limits,
-        env,
-        "stderr",
-        json.dumps(options).encode(),
-    )
+    try:
+        child = run_confined(
+            [sys.executable, "-P", "-m", _MODULE, *arguments],
+            limits,
+            env,
+            "stderr",
+            json.dumps(options).encode(),
+        )
+    except OSError as error:
+        raise EnvironmentFailure(f"did not start ({error.strerror})") from None
     if child.excess == "time":
         raise OutOfResources(f"took longer than {seconds:g} s of processor time")
     if child.excess == "memory":
@@ -77,27 +95,52 @@ def call_confined(
     try:
         answer = json.loads((folder / _ANSWER).read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        reason = f"exit code {child.code}"
-        lines = child.output.decode(errors="replace").strip().splitlines()
-        if lines:
-            reason = lines[-1]
-        raise ChildProcessError(f"failed ({reason})") from None
+        raise _failure(folder, child.code, child.output.decode(errors="replace")) from None
     if "error" in answer:
         raise CongraspError(answer["error"])
+    if "environment" in answer:
+        raise EnvironmentFailure(f"failed ({answer['environment']})")
     return answer["result"]
 
 
-def _child(called: str, folder: str, memory: str, seconds: str, parent: str) -> None:
+def _failure(folder: pathlib.Path, code: int, output: str) -> ChildProcessError:
+    """Returns the error of a child without an answer.
+
+    Args:
+      folder: folder of the call.
+      code: exit code of the child.
+      output: what it wrote to its standard error.
+    """
+    reason = causes.cause_in(output) or causes.last_line(output) or f"exit code {code}"
+    if not (folder / _STARTED).exists():
+        return EnvironmentFailure(f"did not start ({reason})")
+    if code == 0:  # where the ends of children are ignored, their exit codes are lost
+        return EnvironmentFailure("ended without an answer")
+    if -code in _FROM_OUTSIDE:
+        return EnvironmentFailure(f"was ended by {signal.Signals(-code).name}")
+    if causes.is_shortage(output):
+        return OutOfResources(f"failed ({reason})")
+    return ChildProcessError(f"failed ({reason})")
+
+
+def _child(
+    called: str, folder: str, memory: str, seconds: str, parent: str, *packages: str
+) -> None:
     """Calls the function; ends at a limit, or when the parent is gone."""
     module, _, name = called.partition(":")
     function = getattr(importlib.import_module(module), name)
+    for package in packages:
+        importlib.import_module(package)
     options = json.load(sys.stdin)
     end_with(int(parent))
     limit_this_process(int(memory), float(seconds))
+    pathlib.Path(folder, _STARTED).touch()
     try:
         answer = {"result": function(pathlib.Path(folder), **options)}
     except CongraspError as error:
         answer = {"error": str(error)}
+    except (ImportError, OSError) as error:
+        answer = {"environment": f"{type(error).__name__}: {error}"}
     pathlib.Path(folder, _ANSWER).write_text(json.dumps(answer), encoding="utf-8")
 
 

@@ -130,7 +130,7 @@ def _references(
     from congrasp.common.policy.pretrained import policy_file, reference_file
     from congrasp.services.evaluate.experiment import Experiment
 
-    file = policy or reference_file(hand.name) or policy_file(None, hand.name)
+    file = policy or reference_file(hand.reference) or policy_file(None, hand.reference)
     bundle = bundles.load(file)
     if bundle.spec.hand_name != hand.name:
         raise CongraspError(

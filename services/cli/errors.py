@@ -31,6 +31,14 @@ _NO_MEMORY = re.compile(
 )
 
 
+_NO_LIBRARY = re.compile(
+    r"cannot open shared object|undefined symbol|version `\S+' not found|invalid ELF header"
+    r"|wrong ELF class|cannot allocate memory in static TLS block|failed to map segment"
+    r"|Library not loaded|DLL load failed"
+)
+"""Errors of the system's loader, which arrive as ImportError, or as OSError without a number."""
+
+
 class Failure(NamedTuple):
     """An error that ends a command."""
 
@@ -43,6 +51,8 @@ def failure_of(error: Exception) -> Failure | None:
     """Returns the line and the exit code of an error; None if the error is a bug."""
     if isinstance(error, CongraspError):
         return Failure(str(error), error.exit_code)
+    if isinstance(error, ImportError | OSError) and _NO_LIBRARY.search(str(error)):
+        return _usage_failure(_unloadable_text(error))
     if isinstance(error, OSError):
         return _usage_failure(_system_text(error))
     # Libraries whose own types would have to be imported raise these
@@ -71,9 +81,22 @@ def _system_text(error: OSError) -> str | None:
         return "There is no folder for temporary files that can be written. Set TMPDIR to one."
     if error.errno == errno.ENOENT and not error.filename:
         return "The working folder does not exist any more. Change to another."
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return f"{error.strerror}. Raise the limit ('ulimit -n 1024'), and start again."
     if error.errno == errno.EIO:
         return "A file could not be read or written, because its disk failed. Try another path."
     return None
+
+
+def _unloadable_text(error: ImportError | OSError) -> str:
+    """Returns the line about a library that the system cannot load."""
+    reason = str(error).strip().splitlines()[0].rstrip(".")
+    return str(
+        CongraspError(
+            f"A library cannot be loaded ({reason}).",
+            "Install it with the system's packages, or install congrasp in a new environment.",
+        )
+    )
 
 
 def _library_failure(error: Exception) -> Failure | None:

@@ -25,11 +25,13 @@ from congrasp.services.cli.process import (
     SIGNALLED,
     end_process,
     prepare_streams,
+    restore_signals,
     undo_interpreter_options,
     write_if_possible,
 )
 from congrasp.services.cli.terminal import ensure_width
 from congrasp.services.cli.variables import check_xla_flags
+from congrasp.services.cli.words import check_typography, expand_homes
 from congrasp.services.ops.interrupts import interrupts_reach
 from congrasp.services.ops.lifetime import follow_parent, on_signal, stopped_line
 from congrasp.services.ops.logs import announce_progress, log_error
@@ -90,6 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     owns_process = arguments is None
     if owns_process:
         prepare_streams()
+        restore_signals()
         undo_interpreter_options()
     words = list(sys.argv[1:] if arguments is None else arguments)
     follow_parent()
@@ -125,11 +128,11 @@ def _exit_code(arguments: list[str], debug: bool) -> int:
 
 
 def run(arguments: list[str]) -> int:
-    """Runs one command; returns its exit code, 130 after Ctrl-C and 143 after SIGTERM."""
+    """Runs one command; returns its exit code, 128 and the number of the signal that stopped it."""
     if not arguments or arguments[0] in ("-h", "--help"):
         print(usage())
         return 0
-    name, *rest = arguments
+    name, *words = arguments
     if name == "--version":
         print(congrasp.__version__)
         return 0
@@ -137,6 +140,8 @@ def run(arguments: list[str]) -> int:
         kind = "option" if name.startswith("-") else "command"
         remedy = suggestions.command_remedy(arguments, list(COMMANDS))
         raise CongraspError(f"There is no {kind} '{name}'.", remedy)
+    rest = expand_homes(words)
+    check_typography(rest)
     check_inputs(rest)
     check_xla_flags()
     prepare_environment()

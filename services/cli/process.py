@@ -9,11 +9,14 @@ import warnings
 from typing import NoReturn, TextIO
 
 from congrasp.common.runtime.environment import child_environment
-from congrasp.common.runtime.platforms import replace_process
+from congrasp.common.runtime.platforms import STOP_SIGNALS, replace_process
 from congrasp.services.ops.lifetime import SIGNALS
 
-SIGNALLED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
-"""Exit codes after Ctrl-C and SIGTERM."""
+SIGNALLED = tuple(128 + number for number in STOP_SIGNALS)
+"""Exit codes after a signal."""
+_INSPECT = "PYTHONINSPECT"
+_NEEDED_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGCHLD")
+"""Signals that a command or its children need."""
 _QUIET_WARNINGS = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
 """Categories that Python itself ignores."""
 
@@ -28,11 +31,25 @@ def prepare_streams() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
+def restore_signals() -> None:
+    """Undoes settings of signals that a command inherits from the program that starts it.
+
+    If the ends of children are ignored, their exit codes are lost: a process that died would count
+    as finished. Blocked signals would not stop the command.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        return
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.Signals[name] for name in _NEEDED_SIGNALS])
+
+
 def undo_interpreter_options() -> None:
     """Undoes the interpreter's options that change what a command does: removed docstrings, which
-    are the help, and filters that turn warnings into errors.
+    are the help, an interactive end, which loses the exit code, and filters that turn warnings into
+    errors.
     """
-    if sys.flags.optimize > 1:
+    is_inspected = sys.flags.inspect and _INSPECT in os.environ
+    if sys.flags.optimize > 1 or is_inspected:
         command = [sys.executable, "-m", "congrasp", *sys.argv[1:]]
         replace_process(command, child_environment())
     if sys.warnoptions:

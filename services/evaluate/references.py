@@ -89,9 +89,12 @@ def reference_policy(bundle: PolicyBundle) -> tuple[PolicyBundle, str]:
 
     The package has one for the hands of its pretrained policies; for any other hand it is the
     policy itself, under headings and affordances only.
+
+    Raises:
+      CongraspError: the package's file is missing.
     """
     hand = get_hand(bundle.spec.hand)
-    file = reference_file(hand.name) if hand.reference == hand.name else None
+    file = reference_file(bundle.spec.hand)
     if file is None:
         return bundle, "the policy itself, under headings and affordances"
     return bundles.load(file), f"the reference policy of the {hand.name} hand"

@@ -109,6 +109,11 @@ def cause_in(text: str) -> str:
     return _quote(crashes[-1]) if crashes else ""
 
 
+def is_shortage(text: str) -> bool:
+    """True if a log reports a lack of memory or threads."""
+    return any(_find_shortage(line) is not None for line in text.splitlines())
+
+
 def last_line(text: str) -> str:
     """Returns the last line of a log that is not empty."""
     lines = text.strip().splitlines()

@@ -19,7 +19,7 @@ from packaging.specifiers import SpecifierSet
 from congrasp.common.errors import CongraspError
 from congrasp.common.transport import urls
 from congrasp.common.transport.keys import FLOWS
-from congrasp.common.transport.ports import LEARNER_URL
+from congrasp.common.transport.ports import LEARNER_URL, LOOPBACK_REMEDY, loopback_fault
 from congrasp.services.ops.certificates import certificates
 from congrasp.services.ops.status import ask
 
@@ -223,7 +223,12 @@ def check_warp() -> Iterator[Finding]:
 
 
 def check_ports() -> Iterator[Finding]:
-    """Checks the default ports of a learner."""
+    """Checks the loopback interface and the default ports of a learner."""
+    fault = loopback_fault()
+    if fault:
+        state = f"the loopback interface does not work ({fault})"
+        yield Finding("ports", False, state, LOOPBACK_REMEDY)
+        return
     last = PORT + len(FLOWS) - 1
     for port in range(PORT, last + 1):
         with socket.socket() as probe:

@@ -32,7 +32,7 @@ to kill the child.
 """
 SIGNALS = "signals"
 """Name of the thread that acts on signals; it runs no native code."""
-_PARENT_VARIABLE = "CONGRASP_PARENT"
+PARENT_VARIABLE = "CONGRASP_PARENT"
 """Environment variable with the parent's process number, which makes a child end with it."""
 POLL_S = 0.5
 """Time between two looks at a child, s."""
@@ -42,7 +42,7 @@ _children: weakref.WeakSet[subprocess.Popen[bytes]] = weakref.WeakSet()
 
 
 class Stop(threading.Event):
-    """Event set by the first SIGINT or SIGTERM; loops poll it or wait on it.
+    """Event set by the first signal of `STOP_SIGNALS`; loops poll it or wait on it.
 
     Attributes:
       signal: number of the received signal, or None.
@@ -96,7 +96,8 @@ def on_signal(grace: float | None = None, *, interrupt: bool = False) -> Iterato
         if interrupt:
             raise KeyboardInterrupt
 
-    previous = {number: signal.signal(number, handle) for number in platforms.STOP_SIGNALS}
+    obeyed = [number for number in platforms.STOP_SIGNALS if _is_obeyed(number)]
+    previous = {number: signal.signal(number, handle) for number in obeyed}
     wakeup = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
     watch = threading.Thread(
         target=_watch_signals, args=(reader, stop, grace, interrupt), daemon=True, name=SIGNALS
@@ -109,6 +110,11 @@ def on_signal(grace: float | None = None, *, interrupt: bool = False) -> Iterato
         for number, handler in previous.items():
             signal.signal(number, handler)
         writer.close()
+
+
+def _is_obeyed(number: signal.Signals) -> bool:
+    """False for the end of a terminal under `nohup`."""
+    return number.name != "SIGHUP" or signal.getsignal(number) is not signal.SIG_IGN
 
 
 def _default_grace(interrupt: bool) -> float:
@@ -165,7 +171,7 @@ def _end(code: int) -> None:
 
 def follow_parent() -> None:
     """Makes this process receive SIGTERM when its parent has ended, if that requested it."""
-    parent = os.environ.pop(_PARENT_VARIABLE, None)
+    parent = os.environ.pop(PARENT_VARIABLE, None)
     if parent is not None:
         platforms.terminate_with(int(parent))
 
@@ -217,7 +223,7 @@ class Child:
         """Starts it in a separate session, so that Ctrl-C reaches only the orchestrator; it dies
         with its parent.
         """
-        additions = {**self.environment, _PARENT_VARIABLE: str(os.getpid())}
+        additions = {**self.environment, PARENT_VARIABLE: str(os.getpid())}
         environment = child_environment(**additions)
         # Unfiltered, so that the last line of the log is the error, and not JAX's note on filtered
         # frames.

@@ -44,7 +44,7 @@ _T = TypeVar("_T")
 LIGHTEST_G = 1
 HEAVIEST_G = 5000
 LONGEST = Phases(approach=10.0, lift=0.5, hold=10.0)
-_UNCHANGED_WEIGHT = {"mass_g": 0.0, "material": ""}
+_UNCHANGED_WEIGHT: dict[str, Any] = {"mass_g": 0.0, "material": ""}
 """Leaves the mass of the object unchanged."""
 _DRAWING = "drawing"
 """Result of a job that rendered a picture or a video, in place of a motion's number."""
@@ -84,6 +84,8 @@ class Session:
         self._thumbnails = Thumbnails()
         self._drawn: Download | None = None
         self._weight = dict(_UNCHANGED_WEIGHT)
+        self._weight_is_newer = False
+        """True if the weight was set after the last object began to load: it is meant for that."""
         self._phases = PLAIN
         self._hand = next(iter(hands))
         self._object = objects.names[0]
@@ -286,7 +288,9 @@ class Session:
         self._import(upload.path.name, load)
 
     def _weigh(self, mass_g: float = 0, material: str = "") -> None:
-        """Sets the object's mass: `mass_g`, else by a material, else its original mass."""
+        """Sets the object's mass: `mass_g`, else by a material, else its original mass. An object
+        that is loading gets it, too.
+        """
         if mass_g and not LIGHTEST_G <= mass_g <= HEAVIEST_G:
             raise CongraspError(
                 f"The mass is {mass_g:g} g.",
@@ -296,6 +300,7 @@ class Session:
         mass_kg = mass_g / 1000 if mass_g else None
         self._studio.obj = with_mass(obj, mass_kg, material)
         self._weight = {"mass_g": mass_g, "material": material}
+        self._weight_is_newer = True
 
     def _time(self, **phases: float) -> None:
         """Sets approach (s), lift (m) or hold (s) of further grasps."""
@@ -349,7 +354,9 @@ class Session:
             with self._lock:
                 show(loaded)
 
-        return self._jobs.start(text, work)
+        state = self._jobs.start(text, work)
+        self._weight_is_newer = False
+        return state
 
     def _take_hand(self, grasping: PolicyGrasping, obj: GraspObject) -> None:
         """Opens a studio for a policy's hand."""
@@ -367,10 +374,13 @@ class Session:
     def _show(self, name: str) -> None:
         """Shows an object of the catalogue."""
         self._studio.take(self._objects.get(name))
-        self._weight = dict(_UNCHANGED_WEIGHT)
         self._history = History(self._studio)
         self._object = name
         self._shown += 1
+        weight = _UNCHANGED_WEIGHT
+        if self._weight_is_newer:
+            weight = self._weight
+        self._weigh(**weight)
 
     def _grasp(self) -> None:
         """Begins the requested grasp, whose motion is kept."""

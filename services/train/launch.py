@@ -23,6 +23,7 @@ from congrasp.common.transport import urls
 from congrasp.common.transport.keys import FLOWS
 from congrasp.common.transport.ports import (
     LEARNER_URL,
+    check_loopback,
     check_ports,
     local_url,
     rank_url,
@@ -100,6 +101,8 @@ class Launch:
         elif actors is None:
             # Two actors on two cores would compile the same programs at the same time.
             actors = min(2, max(1, cores() // 2))
+        if actors:
+            check_loopback()
         return Plan(self, actors, physics, gpus)
 
     def _check_connections(self, run: str) -> None:

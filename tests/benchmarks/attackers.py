@@ -22,7 +22,9 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.transport.keys import FLOWS, Keys
 from congrasp.common.transport.ports import free_port, shifted
 from congrasp.common.wire.codec import Message, encode
+from congrasp.services.ops.lifetime import follow_parent
 from tests.bare_zenoh import bare_session
+from tests.children import following
 
 _SILENT = 300  # connections
 _HUGE = 60 << 20  # bytes
@@ -45,7 +47,9 @@ def attacked(
         str(query or ""),
     ]
     processes = [
-        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+        subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=following()
+        )
         for _ in range(count)
     ]
     try:
@@ -203,5 +207,6 @@ def _whole(session: zenoh.Session, key: str, request: bytes) -> None:
 
 
 if __name__ == "__main__":
+    follow_parent()
     kind, endpoint, run, file = (*sys.argv[1:5], "")[:4]
     KINDS[kind](endpoint, run, pathlib.Path(file).read_bytes() if file else b"")

@@ -21,6 +21,8 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.security import secured
 from congrasp.common.transport.zenoh_session import configuration
 from congrasp.common.wire.codec import MAX_MESSAGE
+from congrasp.services.ops.lifetime import follow_parent
+from tests.children import following
 
 CONNECTIONS = 8
 _FOREVER = 3600.0
@@ -41,7 +43,7 @@ def crowded(
     """
     words = [endpoint, query, int(reads), rate, *certs]
     command = [sys.executable, "-m", "tests.benchmarks.crowds", *map(str, words)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, env=following())
     try:
         assert process.stdout is not None
         assert process.stdout.readline(), "the attacker did not start"
@@ -87,4 +89,5 @@ def main(endpoint: str, file: str, reads: str, rate: str, *certs: str) -> None:
 
 
 if __name__ == "__main__":
+    follow_parent()
     main(*sys.argv[1:])

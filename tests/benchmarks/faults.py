@@ -33,6 +33,7 @@ from congrasp.services.ops.audit import FAULTS as KINDS
 from congrasp.services.ops.audit import Report
 from congrasp.services.ops.audit import compare as audit
 from congrasp.services.train.launch import LAUNCH_FILE, read_launch
+from tests.children import following
 
 _RUN = "quickstart"
 _OPTIONS = (
@@ -65,7 +66,8 @@ _DISK = 24 << 20  # bytes of the disk that is filled
 _FROZEN = 4.0  # seconds, longer than a lease
 _FULL = 3.0  # seconds that a disk stays full
 _TRAINS = (0.5, 3.0)  # seconds of training before a fault
-_RESTARTS = 4  # deaths of one child after which `congrasp train` is started again
+_OF_A_CHILD = ("kill-learner", "kill-actor", "freeze-learner", "freeze-actor")
+"""Faults after which `congrasp train` must continue, however often they occur."""
 
 
 class Run:
@@ -104,7 +106,7 @@ class Run:
         command += ["--actors", str(self._count), "--evaluation", "0"]
         command += ["--resume"] if (self.run_dir / "config.json").exists() else []
         self.process = psutil.Popen(
-            command, stdout=self._output, stderr=subprocess.STDOUT, text=True
+            command, stdout=self._output, stderr=subprocess.STDOUT, text=True, env=following()
         )
         self._transport = urls.connect(self.until(self._endpoint), "observer", wait=_DEADLINE)
         self.until(lambda: len(seen := self._rollouts()) >= self._count and min(seen) > 1)
@@ -212,10 +214,16 @@ class Result(NamedTuple):
     seconds: list[float]
     """From each fault, or from when the disk had room again, to the next update."""
     report: Report
+    starts: int
+    """Times that `congrasp train` was started."""
 
     @property
     def fine(self) -> bool:
-        """True if nothing was lost, duplicated, unmatched or corrupted."""
+        """True if nothing was lost, duplicated, unmatched or corrupted, and no fault of a child ended
+        the run.
+        """
+        if self.kind in _OF_A_CHILD and self.starts > 1:
+            return False
         return not any(self.report.counts[name] for name in KINDS)
 
 
@@ -224,7 +232,8 @@ def faults(actors: int = 2, repeats: int = 20, kinds: tuple[str, ...] = (), seed
     acknowledged: nothing.
 
     Every kind of fault has a run of its own, whose journals are audited. The exit code is 1 if
-    anything was lost, duplicated, unmatched or corrupted.
+    anything was lost, duplicated, unmatched or corrupted, or if deaths of the learner or an actor
+    ended the run.
 
     Args:
       actors: Actor processes.
@@ -236,7 +245,7 @@ def faults(actors: int = 2, repeats: int = 20, kinds: tuple[str, ...] = (), seed
 
     Examples:
       python -m tests.benchmarks faults
-      python -m tests.benchmarks faults --repeats 5
+      python -m tests.benchmarks faults --kinds kill-learner kill-actor --repeats 20
     """
     if unknown := set(kinds) - FAULTS.keys():
         raise CongraspError(
@@ -259,9 +268,8 @@ def faults(actors: int = 2, repeats: int = 20, kinds: tuple[str, ...] = (), seed
                 )
             )
         last = results[-1]
-        console.print(
-            f"{kind}: {'nothing lost' if last.fine else last.report.faults[:5]}; {_rest(last)}"
-        )
+        verdict = "nothing lost" if last.fine else f"{last.report.faults[:5]}"
+        console.print(f"{kind}: {verdict}; {_rest(last)}; `train` started {last.starts} times")
     console.print(_table(results, actors))
     return 0 if all(result.fine for result in results) else 1
 
@@ -269,23 +277,24 @@ def faults(actors: int = 2, repeats: int = 20, kinds: tuple[str, ...] = (), seed
 def _measure(kind: str, run: Run, repeats: int, rng: random.Random) -> Result:
     """Faults of one kind in one run, and the verdict on it."""
     seconds: list[float] = []
+    starts = 0
     try:
-        for number in range(repeats):
-            if number % _RESTARTS == 0 and run.alive:
-                run.stop()
+        for _ in range(repeats):
             if not run.alive:
                 run.start()
+                starts += 1
             version = run.until(run.status)["version"]
             time.sleep(rng.uniform(*_TRAINS))
             FAULTS[kind](run, rng)
             began = time.monotonic()
             if not run.alive:
                 run.start()
+                starts += 1
             run.until(functools.partial(_is_past, run, version + 1))
             seconds.append(time.monotonic() - began)
     finally:
         run.stop()
-    return Result(kind, seconds, audit(run.run_dir))
+    return Result(kind, seconds, audit(run.run_dir), starts)
 
 
 def _is_past(run: Run, version: int) -> bool:
@@ -417,6 +426,7 @@ def _table(results: Sequence[Result], actors: int) -> Table:
     """A row for each kind."""
     columns = (
         "repeats",
+        "starts",
         "accepted",
         "survived",
         *KINDS,
@@ -427,11 +437,12 @@ def _table(results: Sequence[Result], actors: int) -> Table:
     table = Table("fault", title=f"{actors} actors")
     for column in columns:
         table.add_column(column, justify="right")
-    for kind, seconds, report in results:
+    for kind, seconds, report, starts in results:
         counts = report.counts
         survived = counts["used"] + counts.get("waiting", 0)
         numbers = [
             len(seconds),
+            starts,
             counts["accepted"],
             survived,
             *(counts[name] for name in KINDS),

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from tests.browser import SIZE, chromium, drag, on_object, picture
+from tests.children import following
 
 _PHONE = {"width": 390, "height": 844}
 _HELD = 6
@@ -58,7 +59,7 @@ def screens(
 def _served(*arguments: str) -> Iterator[str]:
     """Address of a page of `congrasp view`."""
     command = [sys.executable, "-m", "congrasp", "view", *arguments, "--port", "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=following()) as server:
         assert server.stdout
         try:
             yield next(

@@ -25,6 +25,7 @@ from congrasp.services.assets.objects.meshes import import_source
 from congrasp.services.assets.objects.named import ObjectAt, objects_at
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.assets.objects.sources import Source, find_sources
+from tests.children import BUSY, following
 
 _DEFINITION = (
     f"Within: surface error at most {1000 * MAX_SURFACE_ERROR_M:g} mm and volume error at most "
@@ -175,8 +176,8 @@ def _processor_seconds() -> float:
 @contextlib.contextmanager
 def _busy_processes(count: int) -> Iterator[None]:
     """Keeps cores busy."""
-    command = [sys.executable, "-c", "while True: pass"]
-    processes = [subprocess.Popen(command) for _ in range(count)]
+    command = [sys.executable, "-c", BUSY]
+    processes = [subprocess.Popen(command, env=following()) for _ in range(count)]
     try:
         yield
     finally:

@@ -27,6 +27,8 @@ from congrasp.common.transport.ports import free_port
 from congrasp.common.wire.codec import Message
 from congrasp.common.wire.messages import RolloutForm
 from congrasp.learner.hub.staleness import StalenessManager
+from congrasp.services.ops.lifetime import follow_parent
+from tests.children import following
 from tests.partition import Medium, cuttable
 from tests.rollouts import bundle, learner_hub, rollout
 
@@ -149,7 +151,7 @@ def _table(rows: list[dict[str, Any]]) -> Table:
 def _process(role: str, endpoint: str, options: dict[str, Any]):
     """A process of this file while the block runs."""
     command = [sys.executable, "-m", __name__, role, endpoint, json.dumps(options)]
-    process = subprocess.Popen(command)
+    process = subprocess.Popen(command, env=following())
     try:
         yield process
     finally:
@@ -220,5 +222,6 @@ def _act(endpoint: str, options: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
+    follow_parent()
     role, endpoint, options = sys.argv[1:]
     {"learner": _learn, "actor": _act}[role](endpoint, json.loads(options))

@@ -55,7 +55,7 @@ def test_settings_of_the_learner_alone_may_change(run):
 def test_settings_of_the_actors_may_not_change(run, change):
     folder, config = run
     with pytest.raises(
-        CongraspError, match=rf"cannot change '{next(iter(change))}'.* Start .*--initial"
+        CongraspError, match=rf"cannot change '{next(iter(change))}'.* Start another run\."
     ):
         continue_run(folder, dataclasses.replace(config, **change))
     assert open_run(folder) == config
@@ -116,7 +116,7 @@ def test_an_existing_run_is_not_started_again(run):
     (folder / "checkpoints" / "latest").symlink_to("gone")
     with pytest.raises(
         CongraspError,
-        match=r"although latest shows that it had one\. Start again in another --run-dir\.",
+        match=r"latest shows that it had one\. In another --run-dir, start another run\.",
     ):
         has_checkpoints(folder)
     (folder / "checkpoints" / "checkpoint_000000004.safetensors").touch()
@@ -339,10 +339,62 @@ def test_a_changed_config_is_refused_on_resume(tmp_path, stored, kind):
     path.write_bytes(edited_config(text, kind))
     assert (path.read_bytes() == text) == (kind == "none")
     if kind == "bit" and stored != "neither":
-        with pytest.raises(CongraspError, match=r"config\.json.*--initial"):
+        with pytest.raises(CongraspError, match=r"config\.json.*start another run\."):
             continue_run(tmp_path, open_run(tmp_path))
     else:
         continue_run(tmp_path, open_run(tmp_path))
+
+
+def damage_config(folder):
+    path = folder / "config.json"
+    path.write_bytes(edited_config(path.read_bytes(), "bit"))
+    continue_run(folder, open_run(folder))
+
+
+REFUSED = {
+    "damaged configuration": damage_config,
+    "changed size": lambda folder: continue_run(folder, RunConfig(environments=7)),
+    "no checkpoint": lambda folder: has_checkpoints(folder),
+}
+"""Actions on the folder of a run that end in the proposal of another one."""
+
+
+@pytest.mark.parametrize("has_policy", [True, False])
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_proposed_policy_exists(tmp_path, name, has_policy):
+    folder = tmp_path / "a run"
+    create_run(folder, RunConfig())
+    policy = folder / "policy.safetensors"
+    if has_policy:
+        policy.write_bytes(b"a policy")
+    (folder / "checkpoints").mkdir()
+    (folder / "checkpoints" / "latest").symlink_to("gone")
+    with pytest.raises(CongraspError, match=r"tart another run") as caught:
+        REFUSED[name](folder)
+    assert (f"--initial '{policy}'" in str(caught.value)) == has_policy
+
+
+UNUSABLE = {
+    "link to nothing": lambda path: path.symlink_to("absent/folder"),
+    "file": lambda path: path.write_text("of the user"),
+    "link to a file": lambda path: path.symlink_to(__file__),
+}
+"""What is in place of a run's folder."""
+
+
+@pytest.mark.parametrize("below", ["", "a/b"])
+@pytest.mark.parametrize("name", UNUSABLE)
+def test_a_run_dir_that_cannot_be_made_is_named(tmp_path, name, below):
+    UNUSABLE[name](tmp_path / "run")
+    with pytest.raises(CongraspError, match=r"--run-dir is .*/run"):
+        create_run(tmp_path / "run" / below, RunConfig())
+
+
+def test_a_run_dir_may_be_a_link(tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "run").symlink_to("disk")
+    create_run(tmp_path / "run", RunConfig())
+    assert open_run(tmp_path / "disk") == open_run(tmp_path / "run") == RunConfig()
 
 
 def test_a_setting_that_may_change_changes_on_resume(tmp_path):

@@ -140,6 +140,7 @@ def test_help_names_every_command_and_every_command_exists():
             ["grasp", "mug:7", "--attempts", "100000000"],
             "--attempts is 100000000. It must be between 1 and 1024",
         ),
+        (["grasp", "mug:7", "\u2014attempts", "2"], "dash of typeset text. Type --attempts"),
         (["grasp"], "nothing to grasp"),
         (["grasp", ""], "An argument is empty"),
         (["grasp", "mug:7", "--out", ""], "--out is empty"),
@@ -250,6 +251,10 @@ def test_a_failed_start_does_not_wait_for_kernels_that_are_being_built(tmp_path)
         (
             OSError(errno.EIO, os.strerror(errno.EIO)),
             "A file could not be read or written, because its disk failed. Try another path.",
+        ),
+        (
+            OSError(errno.EMFILE, os.strerror(errno.EMFILE), "/data/mug.obj"),
+            "Too many open files. Raise the limit ('ulimit -n 1024'), and start again.",
         ),
         (
             FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp']"),
@@ -372,6 +377,26 @@ def test_insufficient_memory_is_one_line(said, what, monkeypatch, capsys):
         f"congrasp: error: The device's memory does not suffice: {what}. Choose fewer "
         f"--environments"
     )
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ImportError("libEGL.so.1: cannot open shared object file: No such file or directory"),
+        ImportError("/lib/libstdc++.so.6: version `GLIBCXX_3.4.32' not found (required by x.so)"),
+        OSError("libgomp.so.1: cannot open shared object file: No such file or directory"),
+    ],
+    ids=str,
+)
+def test_a_library_that_does_not_load_is_named(error, monkeypatch, capsys):
+    def refuse(arguments):
+        raise error
+
+    monkeypatch.setattr(cli, "run", refuse)
+    with pytest.raises(SystemExit) as end:
+        cli.main(["hands"])
+    library = re.escape(str(error).partition(":")[0])
+    is_one_line(end.value.code, capsys.readouterr().err, f"cannot be loaded .*{library}")
 
 
 @pytest.mark.parametrize(

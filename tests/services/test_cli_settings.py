@@ -1,11 +1,17 @@
-"""Commands own their process: variables and folders left over from other programs change nothing."""
+"""Commands own their process: variables, signals and folders left over from other programs change
+nothing.
+"""
 
 import functools
 import pathlib
+import signal
+import subprocess
+import sys
 
 import pytest
 
-from tests.children import python
+from congrasp.common.transport.ports import local_url
+from tests.children import following, python
 
 NAMES = ("random", "json", "types", "logging", "numpy", "jax", "mujoco", "trimesh", "rich", "tyro")
 """Modules that a user's folder may have, too."""
@@ -41,6 +47,7 @@ LEFTOVERS = [
     {"MUJOCO_GL": "foo"},
     {"MPLBACKEND": "module://matplotlib_inline.backend_inline"},
     {"PYTHONOPTIMIZE": "2"},
+    {"PYTHONINSPECT": "1"},
     {"PYTHONWARNINGS": "error"},
     {"JAX_ENABLE_X64": "1", "JAX_NUMPY_RANK_PROMOTION": "raise", "JAX_DISABLE_JIT": "1"},
     {"LC_ALL": "POSIX"},
@@ -50,6 +57,7 @@ TOGETHER = {
     "MUJOCO_GL": "osmesa",
     "MPLBACKEND": "module://absent",
     "PYTHONOPTIMIZE": "2",
+    "PYTHONINSPECT": "1",
     "PYTHONWARNINGS": "error",
     "JAX_ENABLE_X64": "1",
     "JAX_NUMPY_RANK_PROMOTION": "raise",
@@ -69,6 +77,45 @@ def test_variables_change_no_command(variables):
 def test_help_without_docstrings_is_the_same(command):
     variables = {"PYTHONOPTIMIZE": "2"}
     assert output("-m", "congrasp", command, "--help", env=variables) == plain(command, "--help")
+
+
+def test_an_interactive_end_keeps_the_exit_code():
+    done = python("-m", "congrasp", "levitate", env={"PYTHONINSPECT": "1"})
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
+
+
+INHERITED = """
+import os, signal, sys
+signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+os.execv(sys.executable, [sys.executable, *sys.argv[1:]])
+"""
+"""Starts Python with settings of signals as some programs leave them to those that they start."""
+EXIT_CODE = """
+import subprocess, sys
+from congrasp.services.cli.process import restore_signals
+restore_signals()
+print(subprocess.run([sys.executable, "-c", "raise SystemExit(3)"]).returncode)
+"""
+
+
+def test_exit_codes_of_children_are_not_lost():
+    assert output("-c", INHERITED, "-c", EXIT_CODE) == "3\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_blocked_signals_stop_a_command(number):
+    url = local_url()
+    command = [sys.executable, "-c", INHERITED, "-m", "congrasp", "actor", "--connect", url]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=following()
+    ) as process:
+        for line in process.stdout:
+            if url in line:
+                break
+        process.send_signal(number)
+        process.communicate(timeout=60)
+    assert process.returncode == 128 + number
 
 
 def test_variables_do_not_reach_libraries():

@@ -9,7 +9,7 @@ from typing import Any
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.runtime.physics_library import mujoco
-from congrasp.services.assets.confined import call_confined
+from congrasp.services.assets.confined import EnvironmentFailure, call_confined
 
 MEMORY = 3 << 30
 """Limit of the address space for reading a file, bytes."""
@@ -45,8 +45,8 @@ def confined(
       The function's answer, and the folder.
 
     Raises:
-      CongraspError: of the function; or the file is missing, or takes more than `MEMORY` or
-        `SECONDS`.
+      CongraspError: of the function; or the file is missing, takes more than `MEMORY` or `SECONDS`,
+        or the process cannot run here.
     """
     if not path.is_file():
         raise CongraspError(f"There is no file {path}.", "Check the path.")
@@ -69,6 +69,11 @@ def confined(
         except TimeoutError:
             raise CongraspError(
                 f"Reading {path} took longer than {patience:g} s.", _REMEDY
+            ) from None
+        except EnvironmentFailure as error:
+            raise CongraspError(
+                f"{path} cannot be read here: the process that reads it {error}.",
+                "Remove that cause and try again.",
             ) from None
         except ChildProcessError as error:
             limits = f"the limits are {SECONDS} s and {MEMORY >> 30} GB"

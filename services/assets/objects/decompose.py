@@ -1,11 +1,13 @@
 """Decomposition of a mesh into convex pieces.
 
-A convex mesh is its hull. Others are cut by CoACD, by V-HACD if that fails, or else are their hull.
+A convex mesh is its hull. Others are cut by CoACD, by V-HACD if that fails on the mesh, or else are
+their hull.
 The decomposers are native code, which runs in a confined process. Their pieces are joined
 (`merging`).
 
 The pieces depend on the mesh alone: the work is limited by the settings of the search, each process
-has one thread, and a process that is short of time or memory is an error, not another shape.
+has one thread, and a process that does not start, is short of time or memory, or is ended by others
+is an error, not another shape.
 """
 
 import pathlib
@@ -20,7 +22,7 @@ from trimesh.graph import is_watertight
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import shapes
 from congrasp.common.objects.spec import MAX_MESH_PIECES
-from congrasp.services.assets.confined import OutOfResources, call_confined
+from congrasp.services.assets.confined import EnvironmentFailure, OutOfResources, call_confined
 from congrasp.services.assets.objects.bodies import bodies
 from congrasp.services.assets.objects.hulls import corners_of, deepest, solid_hull
 from congrasp.services.assets.objects.interior import enclosed
@@ -52,6 +54,8 @@ _REPAIR_CELLS = 50
 _WALL_CELLS = 40
 """Cells along an open surface from which CoACD makes a thin wall."""
 _MAX_VHACD_HULLS = 1 << 20
+_PACKAGES = {"coacd": "coacd", "vhacd": "vhacdx"}
+"""Package of each decomposer."""
 _MESH = "mesh.npz"
 _PIECES = "pieces.npz"
 
@@ -101,8 +105,8 @@ def decompose(
       depth: depth of a hollow in a piece from which it is cut, m.
 
     Raises:
-      CongraspError: a decomposer exceeds `MAX_PROCESSOR_S`, or the machine lacks time or memory for
-        it.
+      CongraspError: a decomposer exceeds `MAX_PROCESSOR_S` or cannot run here, or the machine lacks
+        time or memory for it.
     """
     if shown is None:
         shown = vertices[faces]
@@ -111,7 +115,7 @@ def decompose(
         return Decomposition([corners_of(hull)], "convex", [])
     mesh = {"vertices": vertices, "faces": faces, "shown": shown}
     notes: list[str] = []
-    for method in ("coacd", "vhacd"):
+    for method in _PACKAGES:
         cut = _Cut(method=method, volume=volume, max_pieces=max_pieces, depth=depth)
         try:
             pieces = _cut_in_child(mesh, cut)
@@ -130,8 +134,9 @@ def _cut_in_child(mesh: dict[str, Any], cut: _Cut) -> list[np.ndarray]:
       cut: options of the cut.
 
     Raises:
-      CongraspError: it exceeds `MAX_PROCESSOR_S`, or the machine lacks time or memory for it.
-      ChildProcessError: it failed, or found no piece; a predicate without a subject.
+      CongraspError: it exceeds `MAX_PROCESSOR_S` or cannot run here, or the machine lacks time or
+        memory for it.
+      ChildProcessError: it failed on this mesh, or found no piece; a predicate without a subject.
     """
     patience = MAX_WALL_CLOCK_RATIO * MAX_PROCESSOR_S + MAX_WALL_CLOCK_RATIO
     with tempfile.TemporaryDirectory(prefix="congrasp-") as name:
@@ -145,6 +150,7 @@ def _cut_in_child(mesh: dict[str, Any], cut: _Cut) -> list[np.ndarray]:
                 memory=_ADDRESS_SPACE_BYTES,
                 seconds=MAX_PROCESSOR_S,
                 patience=patience,
+                packages=(_PACKAGES[cut.method],),
             )
         except TimeoutError:
             raise CongraspError(
@@ -156,6 +162,11 @@ def _cut_in_child(mesh: dict[str, Any], cut: _Cut) -> list[np.ndarray]:
             raise CongraspError(
                 f"The mesh cannot be cut into convex pieces: {cut.method} {error}.",
                 "Simplify it to fewer triangles, or put convex pieces 'contact*' next to it.",
+            ) from None
+        except EnvironmentFailure as error:
+            raise CongraspError(
+                f"The mesh cannot be cut into convex pieces here: {cut.method} {error}.",
+                "Remove that cause and import the object again.",
             ) from None
         with np.load(folder / _PIECES) as arrays:
             pieces = list(arrays.values())

@@ -23,6 +23,7 @@ export class StudioPanel {
     $("hand").addEventListener("change", () => this.act("hand", { name: $("hand").value }));
     $("object").addEventListener("change", () => this.act("object", { name: $("object").value }));
     $("unit").addEventListener("change", () => this.act("unit", { unit: $("unit").value }));
+    this.#keepWhileTyped($("mass"));
     $("mass").addEventListener("change", () => this.act("weigh", { mass_g: Number($("mass").value) }));
     $("material").addEventListener("change", () => this.act("weigh", { material: $("material").value }));
     for (const input of document.querySelectorAll("[data-phase]"))
@@ -40,18 +41,24 @@ export class StudioPanel {
     $("roll").addEventListener("input", () => this.#roll($("roll").value, this.gesture));
     $("roll").addEventListener("change", () => (this.gesture = Date.now()));
     const typed = $("roll-number");
-    typed.addEventListener("input", () => (this.typing = true)); // a newer state must not overwrite what is typed
-    typed.addEventListener("blur", () => (this.typing = false));
-    typed.addEventListener("change", () => {
-      this.typing = false;
-      this.#roll(typed.value);
-    });
+    this.#keepWhileTyped(typed);
+    typed.addEventListener("change", () => this.#roll(typed.value));
     $("save").addEventListener("change", () => {
       this.#save($("save").value);
       $("save").value = "";
     });
     $("grasp").addEventListener("click", () => this.act("grasp", {}));
     this.#drops();
+  }
+
+  // Marks a field while a number is typed into it, which a newer state must not overwrite (`#put`).
+  #keepWhileTyped(input) {
+    input.addEventListener("input", () => input.toggleAttribute("data-typing", true));
+    for (const end of ["change", "blur"]) input.addEventListener(end, () => input.removeAttribute("data-typing"));
+  }
+
+  #put(input, value) {
+    if (!input.hasAttribute("data-typing")) input.value = value;
   }
 
   // Sends an action to the server, in turn; resolves to false if it is refused. A change of the request closes the
@@ -93,7 +100,7 @@ export class StudioPanel {
   #showRoll() {
     if (this.turning) return;
     $("roll").value = this.state.studio.roll_deg;
-    if (!this.typing) $("roll-number").value = this.state.studio.roll_deg;
+    this.#put($("roll-number"), this.state.studio.roll_deg);
   }
 
   // Ctrl-Z undoes, Ctrl-Shift-Z and Ctrl-Y redo; text fields keep their own.
@@ -137,7 +144,7 @@ export class StudioPanel {
     fill($("hand"), state.hands.map((name) => [name, name]), state.hand);
     fill($("object"), state.objects.map((name) => [name, name]), state.chosen);
     fill($("material"), [["", "unchanged"], ...state.weight.materials.map((name) => [name, name])], state.weight.material);
-    $("mass").value = state.weight.mass_g || "";
+    this.#put($("mass"), state.weight.mass_g || "");
     for (const input of document.querySelectorAll("[data-phase]"))
       if (input !== document.activeElement) input.value = state.phases[input.dataset.phase]; // it may be being typed in
     this.#rests(state);

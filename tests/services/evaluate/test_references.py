@@ -1,16 +1,23 @@
 """References of a reference policy: where they come from, and how they are split."""
 
+import dataclasses
+import pathlib
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy import pretrained
 from congrasp.common.policy.pretrained import policy_file, pretrained_hands, reference_file
 from congrasp.common.task.sampling.closed_poses import Poses
 from congrasp.common.task.sampling.object_headings import POSES
 from congrasp.services.evaluate import references
 from congrasp.services.evaluate.references import HELD_OUT
 from tests import task
+
+CLAW = pathlib.Path(__file__).parents[2] / "hands" / "claw.json"
 
 
 @pytest.fixture(scope="module")
@@ -23,6 +30,12 @@ def policy():
     return bundles.load(reference_file("human"))
 
 
+def policy_of(hand):
+    """A policy of another hand."""
+    spec = dataclasses.replace(task.policy().spec, hand=hand)
+    return dataclasses.replace(task.policy(), spec=spec)
+
+
 def test_reference_policies_never_had_poses_or_trajectories():
     for hand in pretrained_hands():
         bundle = bundles.load(reference_file(hand))
@@ -33,6 +46,21 @@ def test_reference_policies_never_had_poses_or_trajectories():
         }
         policy, _ = references.reference_policy(bundles.load(policy_file(None, hand)))
         assert policy.task == bundle.task
+
+
+@pytest.mark.parametrize("hand", ["human", "allegro", "sharpa"])
+def test_a_missing_reference_policy_is_an_error(tmp_path, monkeypatch, hand):
+    """Grasps of the policy under test do not replace it."""
+    policy = policy_of(hand)
+    monkeypatch.setattr(pretrained, "FOLDER", tmp_path)
+    with pytest.raises(CongraspError, match=rf"{hand}-reference\.safetensors is missing"):
+        references.reference_policy(policy)
+
+
+def test_a_custom_hand_has_the_policy_itself_as_reference(tmp_path, monkeypatch):
+    policy = policy_of(CLAW.read_text())
+    monkeypatch.setattr(pretrained, "FOLDER", tmp_path)
+    assert references.reference_policy(policy)[0] is policy
 
 
 @pytest.mark.parametrize("count", range(1, POSES + 1))

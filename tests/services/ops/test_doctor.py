@@ -1,6 +1,7 @@
 """The doctor: what it looks at, and what it says about a machine that is not well."""
 
 import collections
+import errno
 import importlib.metadata
 import itertools
 import os
@@ -13,7 +14,8 @@ import types
 import jax
 import pytest
 
-from congrasp.common.transport.ports import free_port
+from congrasp.common.errors import CongraspError
+from congrasp.common.transport.ports import check_loopback, free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.services.ops import doctor
 from congrasp.services.ops.certificates import create_authority, issue
@@ -68,6 +70,17 @@ def test_a_missing_package_names_the_install_command(monkeypatch):
 
     monkeypatch.setattr(importlib.metadata, "version", missing)
     assert "pip install 'congrasp[train]'" in findings()["mujoco-mjx"].text
+
+
+def test_a_loopback_interface_that_is_down_is_named(monkeypatch):
+    def unreachable(self, address):
+        raise OSError(errno.ENETUNREACH, "Network is unreachable")
+
+    monkeypatch.setattr(socket.socket, "connect", unreachable)
+    found = findings()["ports"]
+    assert not found.fine and "unreachable" in found.text and "ip link set lo up" in found.text
+    with pytest.raises(CongraspError, match=r"unreachable.*ip link set lo up"):
+        check_loopback()
 
 
 def test_a_port_in_use_is_named(monkeypatch):

@@ -59,7 +59,12 @@ main.main(["serve" if KIND == "loading" else "plot"])
 
 @pytest.mark.parametrize("kind", ["plain", "callback", "handler", "loading"])
 @pytest.mark.parametrize(
-    ("number", "code", "word"), [(signal.SIGINT, 130, "Ctrl-C"), (signal.SIGTERM, 143, "SIGTERM")]
+    ("number", "code", "word"),
+    [
+        (signal.SIGINT, 130, "Ctrl-C"),
+        (signal.SIGTERM, 143, "SIGTERM"),
+        (signal.SIGHUP, 129, "SIGHUP"),
+    ],
 )
 def test_command_ends_with_one_line(kind, number, code, word):
     arguments = [sys.executable, "-c", f"KIND = {kind!r}\n{LOOP}"]
@@ -90,3 +95,18 @@ def test_no_interrupt_is_raised_after_the_command(monkeypatch):
         assert raising.wait(30)
         threading.Timer(0.3, proceed.set).start()
     assert raised.is_set()
+
+
+def test_nohup_lets_a_command_continue():
+    ignore = "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)"
+    arguments = [sys.executable, "-c", f"{ignore}\nKIND = 'plain'\n{LOOP}"]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(arguments, stdout=pipe, stderr=pipe, text=True) as process:
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGHUP)
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(1)
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert "Ctrl-C" in error

@@ -291,6 +291,21 @@ def test_on_a_phone_and_in_the_dark_everything_is_within_reach(opened: Any) -> N
 
 
 @pytest.mark.slow
+def test_an_import_keeps_a_mass_that_is_being_typed(
+    opened: Any, site: Site, tmp_path: pathlib.Path
+) -> None:
+    (tmp_path / "mug.stl").write_bytes(b"something")
+    opened.locator("#mass").press_sequentially("250")
+    opened.set_input_files("#file", tmp_path / "mug.stl")
+    opened.wait_for_selector("#facts:has-text('a bit small')")
+    assert opened.input_value("#mass") == "250"
+    opened.press("#mass", "Enter")
+    eventually(lambda: site.studio["object"]["mass_g"] == 250)
+    opened.set_input_files("#file", tmp_path / "mug.stl")
+    eventually(lambda: opened.input_value("#mass") == "")
+    assert site.studio["object"]["mass_g"] != 250
+
+
 def test_a_mesh_is_opened_and_a_wrong_file_is_explained(
     opened: Any, site: Site, tmp_path: pathlib.Path
 ) -> None:

@@ -470,6 +470,43 @@ def test_the_mass_of_an_object_is_set(page: Page, grasping: fake.FakePolicy) -> 
     assert mass() == estimated
 
 
+class HeldImporter(fake.FakeImporter):
+    """Finishes an import once it may."""
+
+    def __init__(self) -> None:
+        self.may_end = threading.Event()
+
+    def load(self, path: pathlib.Path, unit: str) -> Any:
+        self.may_end.wait()
+        return super().load(path, unit)
+
+
+@pytest.mark.parametrize("moment", ["before", "during", "after"])
+def test_a_mass_set_during_an_import_is_that_of_its_object(moment: str) -> None:
+    importer = HeldImporter()
+    session = Session({"fake": fake.FakePolicy}, fake.objects(), importer)
+    server = PageServer(lambda browser: session.routes, "127.0.0.1", 0)
+    page = Page(server.port)
+    try:
+        if moment == "before":
+            page.do("weigh", mass_g=250)
+        page.upload("mug.stl")
+        if moment == "during":
+            page.do("weigh", mass_g=250)
+        importer.may_end.set()
+        page.wait()
+        if moment == "after":
+            page.do("weigh", mass_g=250)
+        state = page.state
+    finally:
+        server.close()
+        session.close()
+    assert state["chosen"] == "bottle_5"
+    is_set = moment != "before"
+    assert (state["studio"]["object"]["mass_g"] == 250) == is_set
+    assert (state["weight"]["mass_g"] == 250) == is_set
+
+
 def test_a_grasp_gets_the_phases_that_were_set(page: Page, grasping: fake.FakePolicy) -> None:
     page.do("time", approach=1.5, lift=0.2)
     page.do("time", hold=1)

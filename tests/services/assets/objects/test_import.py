@@ -27,6 +27,7 @@ from congrasp.services.assets.objects.mesh_files import read_mesh
 from congrasp.services.assets.objects.named import objects_of
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.assets.objects.sources import find_sources
+from tests.children import BUSY, following
 from tests.limits import limited
 from tests.solids import block, ell
 
@@ -214,21 +215,26 @@ def test_an_open_sphere_is_cut_by_coacd():
     assert result.notes == []
 
 
-def break_module(folder, monkeypatch, name):
-    """Makes a module that child processes find first fail on import."""
-    (folder / f"{name}.py").write_text("raise RuntimeError('broken')")
+def replace_module(folder, monkeypatch, name, text):
+    """Puts another module of a name before the installed one, for child processes."""
+    (folder / f"{name}.py").write_text(text)
     monkeypatch.setenv("PYTHONPATH", f"{folder}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+
+
+def failing(function):
+    """A decomposer's module whose function fails on every mesh."""
+    return f"def Mesh(*_): pass\ndef {function}(*_, **__): raise RuntimeError('broken')"
 
 
 def test_vhacd_and_then_the_hull_replace_a_coacd_that_fails(tmp_path, monkeypatch):
     mesh = ell()
-    break_module(tmp_path, monkeypatch, "coacd")
+    replace_module(tmp_path, monkeypatch, "coacd", failing("run_coacd"))
     result = decomposed(mesh)
     assert result.method == "vhacd"
     assert result.notes == ["coacd failed (RuntimeError: broken)"]
     volume = sum(shapes.hull_of(piece).volume for piece in result.pieces)
     assert 0.8 * mesh.volume < volume < 1.2 * mesh.volume
-    break_module(tmp_path, monkeypatch, "vhacdx")
+    replace_module(tmp_path, monkeypatch, "vhacdx", failing("compute_vhacd"))
     result = decomposed(mesh)
     assert result.method == "hull"
     assert len(result.pieces) == 1
@@ -238,17 +244,45 @@ def test_vhacd_and_then_the_hull_replace_a_coacd_that_fails(tmp_path, monkeypatc
     assert "hull" in result.notes[-1]
 
 
+RUNS = "def Mesh(*_): pass\ndef run_coacd(*_, **__):\n    import os\n    "
+SURROUNDINGS = {
+    "absent library": ("raise ImportError('libgomp.so.1')", "libgomp"),
+    "broken package": ("raise RuntimeError('broken')", "did not start .*broken"),
+    "other processor": ("import os\nos.kill(os.getpid(), 4)", "did not start"),
+    "too few threads": ("raise RuntimeError('can\\'t start new thread')", "out of threads"),
+    "full disk": (RUNS + "raise OSError(28, 'No space left on device')", "No space left"),
+    "too few files": (RUNS + "raise OSError(24, 'Too many open files')", "Too many open files"),
+    "lazy import": (RUNS + "import absent_package", "absent_package"),
+    "no memory": (RUNS + "bytearray(1 << 50)", "out of memory"),
+    "no memory for native code": (
+        RUNS + "os.write(2, b'std::bad_alloc\\n')\n    os.abort()",
+        "out of memory",
+    ),
+    "ended by others": (RUNS + "os.kill(os.getpid(), 15)", "SIGTERM"),
+    "killed by the system": (RUNS + "os.kill(os.getpid(), 9)", "killed by the system"),
+}
+"""Failures that are not the mesh's, as modules in place of CoACD, and what their errors name."""
+
+
+@pytest.mark.parametrize("name", SURROUNDINGS)
+def test_failure_of_the_surroundings_is_an_error(tmp_path, monkeypatch, name):
+    """It makes no other shape."""
+    text, named = SURROUNDINGS[name]
+    replace_module(tmp_path, monkeypatch, "coacd", text)
+    with pytest.raises(CongraspError, match=f"coacd .*{named}"):
+        decomposed(ell())
+
+
+def test_a_process_that_cannot_start_is_an_error(monkeypatch):
+    monkeypatch.setattr(sys, "executable", "/absent/python")
+    with pytest.raises(CongraspError, match="coacd did not start"):
+        decomposed(ell())
+
+
 def test_a_cut_beyond_its_limit_is_an_error(monkeypatch):
     """No other shape replaces one that a slow machine does not finish."""
     monkeypatch.setattr(decompose, "MAX_PROCESSOR_S", 0.01)
     with pytest.raises(CongraspError, match=r"coacd took longer than 0\.01 s"):
-        decomposed(ell())
-
-
-def test_a_cut_that_the_system_kills_is_an_error(monkeypatch, tmp_path):
-    (tmp_path / "coacd.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGKILL)")
-    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
-    with pytest.raises(CongraspError, match="killed"):
         decomposed(ell())
 
 
@@ -258,7 +292,7 @@ def test_pieces_do_not_depend_on_free_memory_threads_or_load(monkeypatch):
     monkeypatch.setattr("psutil.virtual_memory", lambda: types.SimpleNamespace(available=1 << 20))
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         monkeypatch.setenv(name, "3")
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(3)]
+    busy = [subprocess.Popen([sys.executable, "-c", BUSY], env=following()) for _ in range(3)]
     try:
         loaded = decomposed(pipe)
     finally:
