@@ -34,8 +34,12 @@ def test_notebook_runs_and_shows_pictures_and_a_motion(tmp_path, monkeypatch):
     notebook = read_notebook()
     resources = {"metadata": {"path": str(tmp_path)}}
     nbclient.NotebookClient(notebook, timeout=600, resources=resources).execute()
-    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
-    shown = [kind for output in outputs for kind in output.get("data", {})]
+    outputs = []
+    shown = []
+    for cell in notebook.cells:
+        outputs += cell.get("outputs", [])
+    for output in outputs:
+        shown += output.get("data", {})
     assert shown.count("image/png") == 4
     assert sum("iframe" in output.get("data", {}).get("text/html", "") for output in outputs) == 1
     assert not [output for output in outputs if output.get("name") == "stderr"]
