@@ -58,7 +58,7 @@ def os_errors_as(
 
 
 _EXTRAS = {
-    **dict.fromkeys(("foxglove", "imageio_ffmpeg", "jinja2", "matplotlib"), "viz"),
+    **dict.fromkeys(("foxglove", "jinja2", "matplotlib"), "viz"),
     **dict.fromkeys(("onnx", "pxr", "pyarrow", "pygltflib", "rosbags"), "export"),
     **dict.fromkeys(("daqp", "mink", "mujoco_menagerie", "qpsolvers"), "arm"),
     "gymnasium": "gym",

@@ -105,7 +105,7 @@ _OLDER_NAMES = {"GraspMotion": "Episode"}
 """Present names of older ones, which still work."""
 
 
-def __getattr__(name: str) -> Any:
+def _public(name: str) -> Any:
     """A public name, imported (PEP 562), or the version of the installed distribution."""
     if name == "__version__":
         metadata = importlib.import_module("importlib.metadata")
@@ -129,6 +129,11 @@ def __getattr__(name: str) -> Any:
     value = getattr(module, name)
     globals()[name] = value
     return value
+
+
+if not TYPE_CHECKING:
+    # Type checkers report unknown names
+    __getattr__ = _public
 
 
 def __dir__() -> list[str]:

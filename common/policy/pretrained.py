@@ -1,5 +1,5 @@
-"""Pretrained policies by hand: those of the package, and the user's, stored next to the files of
-custom hands.
+"""Pretrained policies by hand and name: those of the package, downloaded ones, and the user's,
+stored next to the files of custom hands.
 """
 
 import os
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import HANDS, get_hand, hands_folder, own_hands
+from congrasp.common.io.files import user_folder
 from congrasp.common.runtime.lazy_module import LazyModule
 
 if TYPE_CHECKING:
@@ -20,6 +21,8 @@ FOLDER = pathlib.Path(__file__).with_name("data")
 SUFFIX = ".safetensors"
 _WITH_REFERENCE = ("human", "allegro", "sharpa")
 """Hands whose reference policy is part of the package."""
+_REFERENCE = "-reference"
+"""End of the names of policies that the yardstick takes references from."""
 
 
 def pretrained_file(hand: str) -> pathlib.Path | None:
@@ -44,33 +47,66 @@ def packaged_file(name: str) -> pathlib.Path:
     return FOLDER / f"{name}{SUFFIX}"
 
 
+def packaged_policies() -> dict[str, pathlib.Path]:
+    """Policies of the package by name, without those that only make references."""
+    files = _policies_in(FOLDER)
+    return {name: file for name, file in files.items() if not name.endswith(_REFERENCE)}
+
+
+def policies_folder() -> pathlib.Path:
+    """Folder of downloaded policies: `CONGRASP_POLICIES`, or congrasp/policies in the user's
+    data.
+    """
+    named = os.environ.get("CONGRASP_POLICIES")
+    if named:
+        return pathlib.Path(named)
+    return user_folder("XDG_DATA_HOME", ".local/share") / "congrasp" / "policies"
+
+
+def stored_file(name: str) -> pathlib.Path:
+    """Path of the downloaded policy of this name, whether or not it exists."""
+    return policies_folder() / f"{name}{SUFFIX}"
+
+
+def stored_policies() -> dict[str, pathlib.Path]:
+    """Downloaded policies by name."""
+    return _policies_in(policies_folder())
+
+
+def _policies_in(folder: pathlib.Path) -> dict[str, pathlib.Path]:
+    """Policies of a folder by name, in alphabetical order; none if there is no folder."""
+    return {file.stem: file for file in sorted(folder.glob(f"*{SUFFIX}"))}
+
+
 def own_policy_file(name: str) -> pathlib.Path:
     """Path of the user's policy for the hand of this name, whether or not it exists."""
     return hands_folder() / f"{name}{SUFFIX}"
 
 
 def named_policy(name: str | os.PathLike[str]) -> pathlib.Path:
-    """Returns the policy file of this path, or the pretrained one of this name (`allegro-student`)
-    or hand.
+    """Returns the policy file of this path, or the pretrained or downloaded one of this name
+    (`allegro-student`) or hand.
 
     Raises:
       CongraspError: there is no such hand, or no policy for it.
     """
     path = pathlib.Path(name)
-    is_policy = bool(path.suffix or path.exists() or _packaged(path))
+    is_policy = bool(path.suffix or path.exists() or _named(path))
     if str(name) in HANDS or not is_policy:
         return policy_file(None, str(name))
     return policy_file(path)
 
 
-def _packaged(name: pathlib.Path) -> pathlib.Path | None:
-    """Returns the package's policy file of this name, unless there is such a file in the working
-    directory.
+def _named(name: pathlib.Path) -> pathlib.Path | None:
+    """Returns the policy file of this name in the package or among downloaded ones, unless there is
+    such a file in the working directory.
     """
     if len(name.parts) != 1 or name.exists():
         return None
-    file = packaged_file(str(name))
-    return file if file.exists() else None
+    for file in (packaged_file(str(name)), stored_file(str(name))):
+        if file.exists():
+            return file
+    return None
 
 
 def reference_file(hand: str) -> pathlib.Path | None:
@@ -83,7 +119,7 @@ def reference_file(hand: str) -> pathlib.Path | None:
     spec = get_hand(hand)
     if spec.text or spec.name not in _WITH_REFERENCE:
         return None
-    path = packaged_file(f"{spec.name}-reference")
+    path = packaged_file(f"{spec.name}{_REFERENCE}")
     if not path.exists():
         raise CongraspError(
             f"{path} is missing: the policy whose grasps are the references of the hand "
@@ -118,7 +154,7 @@ def policy_file(policy: pathlib.Path | None, hand: str = "human") -> pathlib.Pat
         hand of this name.
     """
     if policy:
-        return _packaged(policy) or policy
+        return _named(policy) or policy
     path = pretrained_file(hand)
     spec = get_hand(hand)
     if path is not None and spec.text and bundles.load(path).spec.hand != spec.text:

@@ -1,1 +1,1 @@
-"""Importers of user files: meshes, hand files, captured grasps."""
+"""Importers of user files (meshes, hand files, captured grasps), and downloads of policies."""

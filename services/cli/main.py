@@ -49,6 +49,7 @@ COMMANDS = {
     "query": "query a policy server for one action, or measure its latency",
     "objects": "generate, import, list and show objects",
     "hands": "list, draw, check and import hands; from a URDF to its policy",
+    "policies": "list policies, and download those of a release",
     "constraints": "make and show the constraint sets of objects",
     "record": "record a run to MCAP, from this machine or another",
     "plot": "draw a run's learning curves and reward terms",

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from congrasp.common import mirror
 from congrasp.common.request import GraspRequest, Pose
@@ -74,7 +75,7 @@ def mirrored_request(request: GraspRequest) -> GraspRequest:
     )
 
 
-def _vectors(array: np.ndarray | None) -> np.ndarray | None:
+def _vectors(array: ArrayLike | None) -> np.ndarray | None:
     """Mirrored points or directions, if there are any."""
     return None if array is None else mirror.vector(array)
 

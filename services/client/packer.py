@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from congrasp.common.errors import RefusedError
 from congrasp.common.wire.codec import Message
@@ -31,7 +32,7 @@ class Packer:
         self,
         layout: Mapping[str, Any],
         episode: Mapping[str, np.ndarray],
-        constraints: Mapping[str, Mapping[str, np.ndarray]],
+        constraints: Mapping[str, Mapping[str, ArrayLike]],
     ):
         """Begins an episode.
 

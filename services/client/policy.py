@@ -4,11 +4,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from congrasp.common.request import GraspRequest
 from congrasp.common.transport.base import Closing
 
-State = Mapping[str, np.ndarray]
+State = Mapping[str, ArrayLike]
 """Current state of hand and object, by field; see `Policy.act`."""
 
 

@@ -285,7 +285,7 @@ def prescribed(request: GraspRequest) -> tuple[np.ndarray, np.ndarray] | None:
     """
     for constraint in reversed(CONSTRAINTS):
         if constraint.name in request.constraints:
-            path = constraint.wrist_path(request.constraints[constraint.name])
+            path = constraint.wrist_path(request.goal(constraint.name))
             if path is not None:
                 return path
     return None

@@ -248,7 +248,7 @@ class Grasper:
             obj = obj.mirrored()
             request = mirrored_request(request)
         if request.avoid is not None:
-            obj = with_avoid(obj, request.avoid)
+            obj = with_avoid(obj, np.asarray(request.avoid))
         attempted = self._next_round(Attempted(obj, request, ()), progress)
         while not attempted.rounds[-1].meets.any() and self._may_retry(attempted):
             attempted = self._next_round(attempted, progress)

@@ -202,7 +202,8 @@ def _save_import_picture(
     if not source or not job.settings.pictures:
         return
     progress("Drawing the object", 0, 0)
-    sheet = import_sheet(grasper.hand, obj, mesh_of_file(source), request.avoid)
+    avoid = None if request.avoid is None else np.asarray(request.avoid)
+    sheet = import_sheet(grasper.hand, obj, mesh_of_file(source), avoid)
     save_png(job.folder / OBJECT, sheet)
 
 

@@ -34,7 +34,7 @@ from congrasp.common.task.sensors.parameters import SensorParameters
 from congrasp.common.task.types import SceneState, Surface
 from congrasp.common.transport.ports import free_port
 from tests.bare_zenoh import bare_session
-from tests.examples import EXAMPLES, example
+from tests.examples import EXAMPLES, ROS2, example
 
 JOINTS = "sensor_msgs/msg/JointState"
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -181,7 +181,8 @@ class Rig:
         direction = " ".join(f"{x:.6f}" for x in heading)
         command = [
             sys.executable,
-            str(EXAMPLES / "ros2_node.py"),
+            "-m",
+            "congrasp_ros2.node",
             *thing,
             "--zenoh",
             self._endpoint,
@@ -196,7 +197,7 @@ class Rig:
             *options,
         ]
         with (self._folder / "node.txt").open("wb") as output:
-            environment = {**os.environ, "PYTHONPATH": str(EXAMPLES.parent)}
+            environment = {**os.environ, "PYTHONPATH": f"{EXAMPLES.parent}{os.pathsep}{ROS2}"}
             self._node = subprocess.Popen(
                 command, stdout=output, stderr=subprocess.STDOUT, env=environment
             )

@@ -19,6 +19,7 @@ import pytest
 import trimesh
 import tyro
 
+import congrasp
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.common.task.metrics import episode_fields
@@ -80,8 +81,16 @@ def test_the_site_builds_without_a_warning(tmp_path):
         "docs",
         str(tmp_path),
     ]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=200)
+    environment = {**os.environ, "CONGRASP_REPOSITORY": "https://example.org/congrasp/"}
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=200, env=environment
+    )
     assert done.returncode == 0, done.stderr
+    questions = (tmp_path / "faq.html").read_text()
+    assert 'href="https://example.org/congrasp/edit/main/docs/faq.md"' in questions
+    assert f"congrasp {congrasp.__version__}" in questions
+    assert 'action="search.html"' in questions
+    assert "afford" in (tmp_path / "searchindex.js").read_text()
     commands = (tmp_path / "reference" / "commands.html").read_text()
     assert all(f"congrasp {name}" in commands for name in main.COMMANDS)
     assert "tall.glb" in (tmp_path / "files.html").read_text()

@@ -509,17 +509,17 @@ def test_a_busy_port_is_named_and_no_run_is_begun(tmp_path, exit_code_of, capfd)
 
 
 @pytest.mark.parametrize(
-    ("package", "arguments"),
+    ("package", "extra", "arguments"),
     [
-        ("matplotlib", ["evaluate", "--table", "noise", "--pictures", "pictures"]),
-        ("imageio_ffmpeg", ["grasp", "mug:7", "--video"]),
+        ("matplotlib", "viz", ["evaluate", "--table", "noise", "--pictures", "pictures"]),
+        ("imageio_ffmpeg", "train", ["grasp", "mug:7", "--video"]),
     ],
 )
-def test_a_missing_package_is_named_before_the_work(package, arguments, monkeypatch):
+def test_a_missing_package_is_named_before_the_work(package, extra, arguments, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
     with (
         mock.patch.dict(os.environ),
-        pytest.raises(MissingPackageError, match=rf"'{package}'.*congrasp\[viz\]"),
+        pytest.raises(MissingPackageError, match=rf"'{package}'.*congrasp\[{extra}\]"),
     ):
         cli.run(arguments)
 

@@ -39,7 +39,7 @@ PALM_TURN = Rotation.from_euler("x", 180, degrees=True)
 
 @pytest.fixture(scope="module")
 def example():
-    return examples.example("ros2_node")
+    return examples.example("congrasp_ros2.node")
 
 
 def camera_node(example, bus, lift=0.0, age=5.0, **options):
@@ -163,7 +163,7 @@ def test_a_policy_with_a_camera_gets_the_object_s_points_alone(example):
 def test_a_cloud_is_read_as_it_comes_over_either_bus(example):
     """rosbags decodes what mcap-ros2-support encodes; rclpy has an array of bytes."""
     message = cloud_of(block(), rows=3)
-    read = sys.modules["ros2_cloud"].read_points
+    read = sys.modules["congrasp_ros2.cloud"].read_points
     seen = CAMERA_TURN.apply(read(message)) + CAMERA
     np.testing.assert_allclose(seen, block(), atol=1e-6)
     kind = example.CLOUD

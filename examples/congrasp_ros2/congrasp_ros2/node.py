@@ -1,9 +1,9 @@
 """A ROS 2 node between a policy server and a robot; without ROS 2 the same messages go over Zenoh.
 
     congrasp serve --policy allegro-student
-    python examples/ros2_node.py mug:7 --hand allegro --dry-run    # with rclpy
+    ros2 run congrasp_ros2 grasp_node mug:7 --hand allegro --dry-run    # with rclpy
     # with zenoh-bridge-ros2dds, or a robot that uses Zenoh:
-    python examples/ros2_node.py mug:7 --hand allegro --zenoh tcp/127.0.0.1:7447
+    grasp_node mug:7 --hand allegro --zenoh tcp/127.0.0.1:7447
 
 | topic | type | what |
 |---|---|---|
@@ -33,14 +33,11 @@ import dataclasses
 import pathlib
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Protocol
 
 import numpy as np
 import tyro
-from ros2_bus import CLOUD, INPUTS, JOINTS, POSE, Bus, RosBus, ZenohBus
-from ros2_cloud import Eye, labelled, seen_object
-from ros2_sensors import Pose, Sensors, read_pose
 from scipy.spatial.transform import Rotation
 
 import congrasp
@@ -52,6 +49,9 @@ from congrasp.services.assets.objects.named import find_object
 from congrasp.services.cli.grasp import Constraints
 from congrasp.services.grasp.parse import read_request
 from congrasp.services.ops.logs import announce_progress
+from congrasp_ros2.bus import CLOUD, INPUTS, JOINTS, POSE, Bus, RosBus, ZenohBus
+from congrasp_ros2.cloud import Eye, labelled, seen_object
+from congrasp_ros2.sensors import Pose, Sensors, read_pose
 
 WAITING = 2.0
 """Seconds after which the node prints what it is waiting for."""
@@ -473,9 +473,33 @@ def report(command: congrasp.Command | None, guard: congrasp.Guard, sensors: Sen
     )
 
 
+def without_ros_arguments(words: Sequence[str]) -> list[str]:
+    """Returns the node's own words of a command line: rclpy reads those from --ros-args to `--`, or
+    to the end, such as names and remappings of a launch file.
+    """
+    own = []
+    is_of_ros = False
+    for word in words:
+        if word == "--ros-args":
+            is_of_ros = True
+        elif is_of_ros and word == "--":
+            is_of_ros = False
+        elif not is_of_ros:
+            own.append(word)
+    return own
+
+
 def main() -> int:
-    """Runs the node until it is interrupted."""
-    arguments = tyro.cli(Arguments, description=__doc__)
+    """Entry point of the node: an error ends it with one line."""
+    try:
+        return serve(without_ros_arguments(sys.argv[1:]))
+    except congrasp.CongraspError as error:
+        sys.exit(str(error))
+
+
+def serve(words: Sequence[str]) -> int:
+    """Runs the node with these options until it is interrupted."""
+    arguments = tyro.cli(Arguments, description=__doc__, args=words)
     if not 0.0 < arguments.slow <= 1.0 or not 0.0 <= arguments.lift <= 0.3:
         raise congrasp.CongraspError("--slow is above 0 and at most 1, --lift from 0 to 0.3 m.")
     with contextlib.ExitStack() as stack:
@@ -500,7 +524,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except congrasp.CongraspError as error:
-        sys.exit(str(error))
+    sys.exit(main())

@@ -1,4 +1,4 @@
-"""Topics of ROS 2 for `ros2_node.py`: through rclpy, or the same messages over Zenoh."""
+"""Topics of ROS 2 for the node: through rclpy, or the same messages over Zenoh."""
 
 import importlib
 import sys

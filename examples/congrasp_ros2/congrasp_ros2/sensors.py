@@ -1,4 +1,4 @@
-"""Joints, and poses in the world frame, from the inputs of `ros2_node.py`."""
+"""Joints, and poses in the world frame, from the inputs of the node."""
 
 import dataclasses
 import sys
@@ -6,13 +6,13 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from ros2_bus import FRAMES, INPUTS
 from scipy.spatial.transform import Rotation
 
 import congrasp
+from congrasp_ros2.bus import FRAMES, INPUTS
 
 if TYPE_CHECKING:
-    from ros2_node import Arguments
+    from congrasp_ros2.node import Arguments
 
 
 _EPOCH = 1e9

@@ -1,4 +1,4 @@
-"""Visible surface of the object in a camera's point clouds, for `ros2_node.py` with a camera
+"""Visible surface of the object in a camera's point clouds, for the node with a camera
 policy.
 """
 
@@ -6,7 +6,6 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from ros2_sensors import Pose
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -15,6 +14,7 @@ from congrasp.common.hands.mjcf import mujoco_link_poses
 from congrasp.common.hands.spec import Hand, capsule_ends
 from congrasp.common.objects.procedural import plain_object
 from congrasp.common.objects.spec import GraspObject, Piece
+from congrasp_ros2.sensors import Pose
 
 FLOOR = 0.005
 """Height above the table from which a point belongs to the object, m."""

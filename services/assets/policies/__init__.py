@@ -1,0 +1,1 @@
+"""Policies of releases that are not part of the package: their index, and downloads."""

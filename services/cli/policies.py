@@ -1,0 +1,156 @@
+"""Policies of the package and of releases: list them, and download more."""
+
+import dataclasses
+import pathlib
+from typing import Annotated
+
+import tyro
+
+from congrasp.common.errors import CongraspError
+from congrasp.common.io.files import check_output
+from congrasp.common.shell import shell_command
+from congrasp.services.assets.policies.index import (
+    VARIABLE,
+    Entry,
+    fetch,
+    has_content,
+    index_source,
+    read_index,
+)
+from congrasp.services.cli.console import in_range, say, show_table
+from congrasp.services.cli.suggestions import nearest
+from congrasp.services.ops.logs import announced
+
+_MB = 1_000_000
+_LARGEST_MB = 10_000
+
+
+@dataclasses.dataclass(frozen=True)
+class List:
+    """List the policies of the package, those that you have downloaded, and those of an index.
+
+    Policies of the package and downloaded ones are listed without a connection, too.
+
+    Examples:
+      congrasp policies list
+      congrasp policies list --index policies.json
+    """
+
+    index: str = ""
+    """Path, or http or https address, of the index; by default that of CONGRASP_POLICIES_INDEX, or
+    of the release."""
+    timeout: float = 30.0
+    """Seconds for an index from the web."""
+
+    def __call__(self) -> int:
+        """Prints a table."""
+        from congrasp.common.policy.pretrained import (
+            packaged_policies,
+            policies_folder,
+            stored_policies,
+        )
+
+        in_range(0.1, timeout=self.timeout)
+        packaged = packaged_policies()
+        stored = stored_policies()
+        rows = [(name, "package", _size(path), "") for name, path in packaged.items()]
+        rows += [(name, "downloaded", _size(path), "") for name, path in stored.items()]
+        source = index_source(self.index)
+        error = None
+        try:
+            entries = read_index(source, self.timeout)
+        except CongraspError as failure:
+            entries = {}
+            error = failure
+        local = {**packaged, **stored}
+        for entry in entries.values():
+            path = local.get(entry.name)
+            if path is None or not has_content(path, entry.sha256):
+                rows.append((entry.name, "index", f"{entry.bytes / _MB:.1f} MB", entry.description))
+        show_table(("policy", "place", "size", "description"), rows)
+        say(f"Downloaded policies are the files in {policies_folder()}.")
+        if error is not None:
+            raise error
+        return 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Get:
+    """Download a policy of an index into your folder of policies.
+
+    The file is stored only if its SHA-256 is that of the index. Afterwards all commands take the
+    name of the policy as --policy.
+
+    Examples:
+      congrasp policies get human-2300
+      congrasp policies get human-2300 --index policies.json --out human.safetensors
+    """
+
+    name: Annotated[str, tyro.conf.Positional]
+    """Name of the policy ('congrasp policies list' prints the names)."""
+    index: str = ""
+    """Path, or http or https address, of the index; by default that of CONGRASP_POLICIES_INDEX, or
+    of the release."""
+    out: pathlib.Path | None = None
+    """File to write; by default NAME.safetensors in your folder of policies ('congrasp policies
+    list' prints this folder)."""
+    timeout: float = 300.0
+    """Seconds for the index, and again for the policy."""
+    limit: float = 100.0
+    """Largest size of a policy, MB."""
+
+    def __call__(self) -> int:
+        """Downloads the policy, and prints its file."""
+        from congrasp.common.policy.pretrained import packaged_policies, stored_file
+
+        in_range(0.1, timeout=self.timeout)
+        in_range(0.001, _LARGEST_MB, limit=self.limit)
+        source = index_source(self.index)
+        entry = _find(self.name, read_index(source, self.timeout), source)
+        packaged = packaged_policies().get(entry.name)
+        target = self.out or stored_file(entry.name)
+        check_output("--out", target, is_folder=False)
+        if packaged is not None and self.out is None:
+            if has_content(packaged, entry.sha256):
+                say(f"'{entry.name}' is part of the package: {packaged}")
+                return 0
+            raise CongraspError(
+                f"The package has another policy with the name '{entry.name}'.",
+                "Pass --out FILE, and this file as --policy.",
+            )
+        if has_content(target, entry.sha256):
+            say(f"{target} is up to date.")
+            return 0
+        with announced(f"Downloading {entry.address}"):
+            fetch(entry, target, round(self.limit * _MB), self.timeout)
+        reference = entry.name if self.out is None else self.out
+        say(target, f"Try: {shell_command('congrasp', 'grasp', 'mug:7', '--policy', reference)}")
+        return 0
+
+
+def _size(path: pathlib.Path) -> str:
+    """Size of a file."""
+    return f"{path.stat().st_size / _MB:.1f} MB"
+
+
+def _find(name: str, entries: dict[str, Entry], source: str) -> Entry:
+    """Returns the policy of this name in an index.
+
+    Raises:
+      CongraspError: the index has none.
+    """
+    if name in entries:
+        return entries[name]
+    if not entries:
+        raise CongraspError(
+            f"The index {source} has no policies.",
+            f"Pass --index with the path or address of another one, or set {VARIABLE}.",
+        )
+    similar = nearest(name, entries)
+    remedy = f"Choose from: {', '.join(entries)}."
+    if similar:
+        remedy = f"Did you mean '{similar}'?"
+    raise CongraspError(f"The index {source} has no policy '{name}'.", remedy)
+
+
+COMMANDS = {"list": List, "get": Get}
