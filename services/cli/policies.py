@@ -19,7 +19,7 @@ from congrasp.services.assets.policies.index import (
 )
 from congrasp.services.cli.console import in_range, say, show_table
 from congrasp.services.cli.suggestions import nearest
-from congrasp.services.ops.logs import announced
+from congrasp.services.ops.logs import announce_progress
 
 _MB = 1_000_000
 _LARGEST_MB = 10_000
@@ -121,7 +121,7 @@ class Get:
         if has_content(target, entry.sha256):
             say(f"{target} is up to date.")
             return 0
-        with announced(f"Downloading {entry.address}"):
+        with announce_progress(f"Downloading {entry.address}"):
             fetch(entry, target, round(self.limit * _MB), self.timeout)
         reference = entry.name if self.out is None else self.out
         say(target, f"Try: {shell_command('congrasp', 'grasp', 'mug:7', '--policy', reference)}")

@@ -26,7 +26,8 @@ from congrasp.services.client.policy import Policy
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.serve.inference import Inference, LocalPolicy, PolicyFunction, load_policy
 from congrasp.services.serve.requests import Layout
-from congrasp.services.serve.server import PolicyServer, follow_file
+from congrasp.services.serve.server import PolicyServer
+from congrasp.services.serve.sources import follow_file
 from congrasp.services.train.command import untrained
 from tests import task
 

@@ -9,13 +9,13 @@ import pytest
 from congrasp.common.hands import get_hand
 from congrasp.common.hands.files import HUMAN
 from congrasp.common.hands.kinematics import link_transforms
-from congrasp.common.hands.motors import coupled
+from congrasp.common.hands.motors import follow_couplings
 from congrasp.common.hands.spec import Capsule, Coupling, Hand, Joint, Link
 from congrasp.common.task.plausibility import hand_hand
 from congrasp.services.assets.captures.references import (
-    OVERLAP,
-    deepest,
-    separated,
+    MAX_OVERLAP_M,
+    greatest_overlap,
+    separate_fingers,
 )
 
 ASIDE = 0.02
@@ -45,9 +45,9 @@ def test_two_fingers_part_evenly():
     hand = two_fingers()
     q = np.array([[-0.38, 0.38]], np.float32)
     overlap = 2 * RADIUS - 2 * (ASIDE - LONG * np.sin(0.38))
-    np.testing.assert_allclose(deepest(hand, q), overlap, atol=1e-6)
-    angle = np.arcsin((ASIDE - RADIUS + OVERLAP / 2) / LONG)
-    np.testing.assert_allclose(separated(hand, q), [[-angle, angle]], atol=2e-4)
+    np.testing.assert_allclose(greatest_overlap(hand, q), overlap, atol=1e-6)
+    angle = np.arcsin((ASIDE - RADIUS + MAX_OVERLAP_M / 2) / LONG)
+    np.testing.assert_allclose(separate_fingers(hand, q), [[-angle, angle]], atol=2e-4)
 
 
 def test_the_other_finger_moves_if_one_is_at_its_limit():
@@ -61,17 +61,17 @@ def test_the_other_finger_moves_if_one_is_at_its_limit():
         links=(stiff.links[0], dataclasses.replace(stiff.links[1], joints=(a,)), stiff.links[2]),
     )
     hand = dataclasses.replace(hand, open_pose={"a": -0.38}, closed_pose={"a": -0.38})
-    angles = separated(hand, np.array([[-0.38, 0.38]], np.float32))
+    angles = separate_fingers(hand, np.array([[-0.38, 0.38]], np.float32))
     assert angles[0, 0] == np.float32(-0.38)
     assert angles[0, 1] < 0.3
-    np.testing.assert_allclose(deepest(hand, angles), OVERLAP, atol=2e-5)
+    np.testing.assert_allclose(greatest_overlap(hand, angles), MAX_OVERLAP_M, atol=2e-5)
 
 
 def test_followers_still_follow():
     hand = two_fingers(couplings=(Coupling("b", "a", -1.0),))
-    angles = separated(hand, np.array([[-0.38, 0.38]], np.float32))
-    np.testing.assert_allclose(angles, coupled(hand, angles), atol=1e-6)
-    np.testing.assert_allclose(deepest(hand, angles), OVERLAP, atol=2e-5)
+    angles = separate_fingers(hand, np.array([[-0.38, 0.38]], np.float32))
+    np.testing.assert_allclose(angles, follow_couplings(hand, angles), atol=1e-6)
+    np.testing.assert_allclose(greatest_overlap(hand, angles), MAX_OVERLAP_M, atol=2e-5)
 
 
 @pytest.mark.parametrize("name", ["human", "sharpa"])
@@ -86,15 +86,15 @@ def test_overlapping_poses_are_separated_within_limits(name):
         + rng.normal(0, 0.25, (12, len(hand.joints)))
     )
     q = np.clip(q, hand.lower, hand.upper).astype(np.float32)
-    before = np.asarray(deepest(hand, q))
-    angles = separated(hand, q)
-    deep = before > OVERLAP
+    before = np.asarray(greatest_overlap(hand, q))
+    angles = separate_fingers(hand, q)
+    deep = before > MAX_OVERLAP_M
     assert deep.any()
     assert not deep.all()
     np.testing.assert_array_equal(angles[~deep], q[~deep])
     assert np.all(angles >= hand.lower)
     assert np.all(angles <= hand.upper)
     np.testing.assert_array_less(
-        hand_hand(hand, link_transforms(hand, jnp.asarray(angles))), OVERLAP + 5e-5
+        hand_hand(hand, link_transforms(hand, jnp.asarray(angles))), MAX_OVERLAP_M + 5e-5
     )
-    np.testing.assert_allclose(separated(hand, angles), angles, atol=1e-3)
+    np.testing.assert_allclose(separate_fingers(hand, angles), angles, atol=1e-3)
