@@ -1,4 +1,4 @@
-"""How many requests of an actor overlap, so that a slow network does not delay its rollouts."""
+"""Number of an actor's requests that overlap, so that a slow network does not delay rollouts."""
 
 import math
 import threading

@@ -172,9 +172,9 @@ BUNDLE = MessageSpec(
         "privileged/mean": ArraySpec(REAL, ("P",), optional=True),
         "privileged/m2": ArraySpec(REAL, ("P",), optional=True),
         "privileged/count": ArraySpec(REAL, (), optional=True),
-        "value/mean": ArraySpec(REAL, ()),
-        "value/m2": ArraySpec(REAL, ()),
-        "value/count": ArraySpec(REAL, ()),
+        "value/mean": ArraySpec(REAL, (), optional=True),
+        "value/m2": ArraySpec(REAL, (), optional=True),
+        "value/count": ArraySpec(REAL, (), optional=True),
     },
     {
         "version": int,

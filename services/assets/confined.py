@@ -84,6 +84,8 @@ def call_confined(
             "stderr",
             json.dumps(options).encode(),
         )
+    except TimeoutError:
+        raise
     except OSError as error:
         raise EnvironmentFailure(f"did not start ({error.strerror})") from None
     if child.excess == "time":

@@ -46,7 +46,7 @@ class _Reader:
         self.lines: list[_Line] = []
         self._columns: Columns | None = None
         self._separator = ""
-        """That of the header, then that of the numbers."""
+        """Separator of the header, then of the numbers."""
         self._comment_cells: list[str] = []
         """Cells of the comment before the numbers, which may be a header that is not known."""
 

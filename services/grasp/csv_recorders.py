@@ -15,7 +15,7 @@ class Recorder(NamedTuple):
     times: tuple[str, ...]
     """Names that a column of the time may have, which is checked and not used."""
     source: str
-    """Where the header comes from."""
+    """Source of the header."""
 
 
 def _ros(name: str, pose: str, time: str, source: str) -> Recorder:
@@ -64,9 +64,9 @@ class Columns(NamedTuple):
     """Columns of a file."""
 
     pose: list[int]
-    """Those of x, y, z and the quaternion w, x, y, z."""
+    """Columns of x, y, z and the quaternion w, x, y, z."""
     time: int | None
-    """That of the time; None without one."""
+    """Column of the time; None without one."""
     width: int
     """Number of columns of the file."""
 

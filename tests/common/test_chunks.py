@@ -153,7 +153,7 @@ def test_outbox_limits_chunks_of_one_account():
 def test_fetch_over_a_slow_link():
     """The deadline applies to each chunk; the whole reply may take longer."""
     outbox = Outbox()
-    payload = bytes(range(256)) * 1024
+    payload = bytes(range(256)) * 8192
     first, head = _first(outbox, payload)
 
     def request_chunk(request, seconds):

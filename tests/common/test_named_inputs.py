@@ -76,7 +76,7 @@ def test_files_of_other_kinds_do_not_matter(config, tmp_path):
 def test_resume_with_other_content_is_refused(config, tmp_path, kind):
     create_run(tmp_path / "run", identified(config))
     (tmp_path / FILES[kind]).write_text("else")
-    with pytest.raises(CongraspError, match=r"run's configuration names .*--initial"):
+    with pytest.raises(CongraspError, match=r"run's configuration names .*start another run"):
         continue_run(tmp_path / "run", open_run(tmp_path / "run"))
 
 

@@ -8,8 +8,8 @@ Only the part of the surface that a ball of radius `_BALL_RADIUS_M` can touch fr
 no finger reaches into a crack, or into a void between pieces. A ball that touches a wall of a crack
 has its centre in the opposite wall.
 
-Bodies that every ray misses are thinner than the rays' distance. Both are then stretched before
-their volumes are compared, and their surfaces are sampled at random.
+A body that every ray misses is thinner than the distance between rays. Its volume is then computed
+from its triangles, so that overlaps of pieces count twice, and its surface is sampled at random.
 """
 
 import math
@@ -120,40 +120,10 @@ def fidelity(
     if union.volume and reference.volume:
         volume_ratio = union.volume / reference.volume
     else:
-        volume_ratio = _thin_volume_ratio(union_triangles, mesh)
+        union_volume = float(mass_properties(union_triangles)["volume"])
+        volume_ratio = union_volume / float(mass_properties(mesh)["volume"])
     distance = _hausdorff_distance(union.surface, reference.surface)
     return Fidelity(volume_ratio - 1, distance)
-
-
-def _thin_volume_ratio(union: np.ndarray, mesh: np.ndarray) -> float:
-    """Volume of a union over that of a closed mesh, for triangles (F, 3, 3) that rays miss.
-
-    Both are stretched to equal lengths along the mesh's principal axes, which changes both volumes
-    by the same factor. If rays miss them still, the pieces' volumes are added, so that overlaps
-    count twice.
-    """
-    corners = mesh.reshape(-1, 3)
-    _, axes = np.linalg.eigh(np.cov(corners.T))
-    axes[:, 0] *= np.sign(np.linalg.det(axes))  # a mirrored mesh would wind inwards
-    lengths = np.ptp(corners @ axes, axis=0)
-    stretch = axes / np.maximum(lengths, np.finfo(float).tiny)
-    stretched_union = union @ stretch
-    stretched_mesh = mesh @ stretch
-    grid = grid_of(np.concatenate([stretched_mesh, stretched_union]))
-    union_volume = _volume(stretched_union, grid)
-    mesh_volume = _volume(stretched_mesh, grid)
-    if union_volume and mesh_volume:
-        return union_volume / mesh_volume
-    return float(mass_properties(union)["volume"] / mass_properties(mesh)["volume"])
-
-
-def _volume(triangles: np.ndarray, grid: RayGrid) -> float:
-    """Volume that triangles (F, 3, 3) enclose, by rays: the mean of three axes."""
-    volumes = []
-    for crossings in cast_rays(triangles, grid):
-        inside = intervals(crossings, seam=0.0)
-        volumes.append(_volume_along(crossings, inside, grid.spacing))
-    return float(np.mean(volumes))
 
 
 def _volume_along(crossings: Crossings, inside: Intervals, spacing: float) -> float:
