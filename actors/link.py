@@ -296,6 +296,7 @@ class ActorLink(Closing):
         """
         self._check()
         self._held_version = newer_than
+        newest = None
         while not self._is_latest():
             self._fetch_ahead()
             fetching = self._weights_ahead
@@ -310,10 +311,11 @@ class ActorLink(Closing):
                 break
             self._held_version = int(fetched.bundle.meta["version"])
             self._held_session = fetched.session
+            newest = fetched.bundle
             if required is None or self._held_version >= required:
-                self._rollout_began = time.monotonic()
-                return fetched.bundle
-        return None
+                break
+        self._rollout_began = time.monotonic()
+        return newest
 
     def _is_latest(self) -> bool:
         """True if the caller has the latest policy that the learner has announced."""
@@ -323,8 +325,8 @@ class ActorLink(Closing):
         )
 
     def _must_wait(self, required: int | None) -> bool:
-        """True if the caller cannot or need not act with its policy while a later one is on its
-        way.
+        """True if a policy on its way is waited for: the caller's is too old, or the wait is
+        short.
         """
         if self._held_session != self._learner[1]:
             return True

@@ -14,6 +14,16 @@ from scipy.spatial import cKDTree
 from congrasp.common.hands.flesh import Skeleton, Surface
 from congrasp.common.hands.rings import closed_surface, ring_angles
 
+_HALF_WIDTH_RAD = 0.90
+"""Half width of a nail, as an angle around the finger."""
+_HALF_LENGTH = 0.85
+"""Half length of a nail along the finger, in radii of the fingertip."""
+_CENTER_BEHIND_TIP = 0.30
+"""Distance of the nail's centre behind the centre of the fingertip's ball, in its radii."""
+_OUTLINE_EXPONENT = 0.65
+"""Exponent of sine and cosine in the nail's outline, a superellipse: 1 gives an ellipse, smaller
+values squarer corners."""
+
 
 class _Ring(NamedTuple):
     """A closed curve of the nail's surface, parallel to the nail's outline."""
@@ -33,15 +43,6 @@ _RINGS = (
     _Ring(0.2, -0.0012),
 )
 """From the middle of the nail's upper side over its border to the middle of its lower side."""
-_HALF_WIDTH_RAD = 0.90
-"""Half width of a nail, as an angle around the finger."""
-_HALF_LENGTH = 0.85
-"""Half length of a nail along the finger, in radii of the fingertip."""
-_CENTER_BEHIND_TIP = 0.30
-"""Distance of the nail's centre behind the centre of the fingertip's ball, in its radii."""
-_OUTLINE_EXPONENT = 0.65
-"""Exponent of sine and cosine in the nail's outline, a superellipse: 1 gives an ellipse, smaller
-values squarer corners."""
 
 
 def nails(skeleton: Skeleton, skin: Surface) -> list[Surface]:

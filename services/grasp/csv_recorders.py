@@ -3,6 +3,11 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+HEADER = "x,y,z,qw,qx,qy,qz"
+"""Header that a message asks for."""
+_ROSTOPIC = "http://wiki.ros.org/rostopic, section rostopic echo -p"
+_BAGPY = "https://jmscslgroup.github.io/bagpy, bagreader.message_by_topic"
+
 
 class Recorder(NamedTuple):
     """Program whose files are read, and the names of its columns in lower case."""
@@ -25,8 +30,6 @@ def _ros(name: str, pose: str, time: str, source: str) -> Recorder:
     return Recorder(name, (x, y, z), (qw, qx, qy, qz), (time,), source)
 
 
-_ROSTOPIC = "http://wiki.ros.org/rostopic, section rostopic echo -p"
-_BAGPY = "https://jmscslgroup.github.io/bagpy, bagreader.message_by_topic"
 RECORDERS = (
     Recorder(
         "congrasp",
@@ -56,8 +59,6 @@ RECORDERS = (
     _ros("bagpy, PoseStamped", "pose", "time", _BAGPY),
     _ros("bagpy, Odometry", "pose.pose", "time", _BAGPY),
 )
-HEADER = "x,y,z,qw,qx,qy,qz"
-"""Header that a message asks for."""
 
 
 class Columns(NamedTuple):
