@@ -35,6 +35,9 @@ _STATES = 128
 _SLACK = 2.0
 _BEYOND = 1.0  # rad by which a finger joint is pressed beyond its limits
 _MAX_TURN = 2 * np.pi  # rad of a wrist hinge
+_CONTACT_SHARES = (0.0, 0.1, 0.5, 1.0)
+"""Shares of a hand's contacts that are closed. Some terms need fingers that touch nothing, others
+fingers that press."""
 _MAX_FORCE = 1e3  # N; terms and observations clip or squash forces far below this
 _FLAGS = ("episode/success", "episode/held", f"episode/{DIVERGED}")
 _MAX_METRIC = 1e6  # limit of an error or a force, in its unit
@@ -148,6 +151,7 @@ def _extremes(hand: Hand, task: TaskConfig) -> _Extremes:
     contacts = (_STATES, len(hand.links), CONTACTS_PER_LINK)
     within = functools.partial(_inside, rng)
     unit = functools.partial(_unit, rng)
+    contact_share = rng.choice(_CONTACT_SHARES, (_STATES, 1, 1))
 
     def joints() -> np.ndarray:
         lower = hand.lower - _BEYOND
@@ -170,7 +174,7 @@ def _extremes(hand: Hand, task: TaskConfig) -> _Extremes:
         object_angular_velocity=within(3, most=MAX_SPEED),
         contact_force=within(*contacts[1:], 3, most=_MAX_FORCE),
         contact_position=start[:, None, None] + within(*contacts[1:], 3, most=0.2),
-        contact_found=rng.random(contacts) < 0.5,
+        contact_found=rng.random(contacts) < contact_share,
         base_position=start + within(3, most=0.1),
         base_quaternion=unit(4),
         q_initial=joints(),

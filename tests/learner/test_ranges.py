@@ -89,10 +89,12 @@ def test_a_curriculum_widens_the_reward_by_its_weights(ranges):
     assert task_ranges(TASK, heavy).reward == pytest.approx(ranges.reward + 2.0 * 10.0, rel=1e-3)
 
 
-def test_every_weighted_term_has_a_range():
+@pytest.mark.parametrize("hand", ["human", "allegro", "sharpa"])
+def test_every_weighted_term_has_a_range(hand):
+    """Also terms that only idle fingers earn, in a hand without coupled joints."""
     names = [field.name for field in dataclasses.fields(RewardWeights)]
     weights = RewardWeights(**{**dict.fromkeys(names, 1.0), "force_max": 5.0})
-    task = dataclasses.replace(TASK, reward=weights)
+    task = dataclasses.replace(TASK, hand=hand, reward=weights)
     ranges = task_ranges(task, CurriculumConfig(ramp=(0, 0))).episodes
     unreachable = [name for name in terms(task) if not ranges[f"term/{name}"][1] > 0.0]
     assert unreachable == []
