@@ -36,6 +36,7 @@ from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.sampling.build import build_bank, with_columns
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.evaluate import references
+from congrasp.services.evaluate.common_batches import run_rows
 from congrasp.services.evaluate.episodes import Batch, Episodes, Sample, join_samples
 from congrasp.services.evaluate.plan import (
     NOMINAL_FRICTION,
@@ -218,10 +219,15 @@ class Experiment:
 
     @property
     def worlds(self) -> int:
-        """Number of parallel worlds: a power of two, or the most; rows have an episode of every
+        """Number of parallel worlds for the episodes of one row, which has at least one of every
         object.
         """
-        episodes = max(self.episodes, len(self.objects))
+        return self.worlds_for(max(self.episodes, len(self.objects)))
+
+    def worlds_for(self, episodes: int) -> int:
+        """Returns the number of parallel worlds for so many episodes: a power of two, or the most
+        that the engine or the user allows.
+        """
         return min(self.batch or ENGINES[self.physics].batch, 1 << (episodes - 1).bit_length())
 
     @functools.cached_property
@@ -327,16 +333,81 @@ class Experiment:
             results.append(self._stored_result(variation, file))
         missing = [n for n, result in enumerate(results) if result is None]
         for task, group in itertools.groupby(missing, lambda n: variations[n].task(self.task)):
-            with self.simulator(task, traced=keep) as running:
-                for n in group:
+            rows = list(group)
+            together = ENGINES[self.physics].on_device and not keep
+            worlds = self.worlds
+            if together:
+                worlds = self.worlds_for(sum(plans[n].total for n in rows))
+            with self.simulator(task, worlds=worlds, traced=keep) as running:
+                for of_run in self._runs(variations, rows, together):
                     finished = sum(result.row.episodes for result in results if result)
                     progress = functools.partial(advance_from, advance, finished)
-                    result = self._run(running, variations[n], plans[n], progress, keep)
-                    results[n] = result
-                    file = row_files[n]
-                    if file is not None:
-                        files.keep(file, Message(result.sample.arrays()), len(row_files))
+                    run_variations = [variations[n] for n in of_run]
+                    run_plans = [plans[n] for n in of_run]
+                    if together:
+                        done = self._run_together(running, run_variations, run_plans, progress)
+                    else:
+                        done = [self._run(running, run_variations[0], run_plans[0], progress, keep)]
+                    for n, result in zip(of_run, done, strict=True):
+                        results[n] = result
+                        file = row_files[n]
+                        if file is not None:
+                            files.keep(file, Message(result.sample.arrays()), len(row_files))
         return [result for result in results if result is not None]
+
+    def _runs(
+        self, variations: Sequence[Variation], rows: Sequence[int], together: bool
+    ) -> Iterator[list[int]]:
+        """Yields the rows of each run of a simulator: neighbours that share their objects if rows
+        run together, else one.
+        """
+        if not together:
+            for n in rows:
+                yield [n]
+            return
+        objects = {n: variations[n].objects(self.scaled) for n in rows}
+        for _, group in itertools.groupby(rows, lambda n: id(objects[n])):
+            yield list(group)
+
+    def _run_together(
+        self,
+        running: Episodes,
+        variations: Sequence[Variation],
+        plans: Sequence[RowPlan],
+        progress: Callable[[int], None],
+    ) -> list[Result]:
+        """Simulates rows of one task and the same objects in common batches; all their episodes
+        continue after the hold.
+        """
+        self._use_objects(running, variations[0].objects(self.scaled))
+        rows = [
+            self._conditions(variation, plan)
+            for variation, plan in zip(variations, plans, strict=True)
+        ]
+        samples = run_rows(running, rows, stressed=running.stressable, progress=progress)
+        results = []
+        for variation, sample in zip(variations, samples, strict=True):
+            results.append(Result(variation, sample, self.row(variation, sample), [], []))
+        return results
+
+    def _conditions(self, variation: Variation, plan: RowPlan) -> InitialConditions:
+        """Returns the initial conditions of all episodes of a row."""
+        task = variation.task(self.task)
+        columns = []
+        for planned, count in batches(
+            self.hand, task, variation.bank(self), plan, self.seed, self.worlds
+        ):
+            conditions = variation.episodes(planned, task.control_dt)
+            columns.append(
+                jax.tree.map(lambda column, count=count: np.asarray(column)[:count], conditions)
+            )
+        joined: InitialConditions = jax.tree.map(lambda *parts: np.concatenate(parts), *columns)
+        return joined
+
+    def _use_objects(self, running: Episodes, objects: Sequence[GraspObject]) -> None:
+        """Replaces a simulator's objects, if they are others."""
+        if objects is not running.objects:
+            running.replace_objects(objects, self.field)
 
     def _stored_result(self, variation: Variation, file: pathlib.Path | None) -> Result | None:
         """Returns the result of a row from its file, without kept episodes; None without one."""
@@ -358,16 +429,18 @@ class Experiment:
         """Digests of the objects."""
         return [store.digest(obj) for obj in self.objects]
 
-    def simulator(self, task: TaskConfig | None = None, *, traced: bool = False) -> Episodes:
-        """Returns a simulator of the objects, by default of the experiment's task; its batch
-        depends on `episodes`.
+    def simulator(
+        self, task: TaskConfig | None = None, *, worlds: int = 0, traced: bool = False
+    ) -> Episodes:
+        """Returns a simulator of the objects, by default of the experiment's task and with
+        `self.worlds` parallel worlds.
         """
         return Episodes(
             self.policy,
             task or self.task,
             self.scaled,
             hold=self.steps,
-            batch=self.worlds,
+            batch=worlds or self.worlds,
             physics=self.physics,
             field=self.field,
             traced=traced,
@@ -444,9 +517,7 @@ class Experiment:
             batches continue as a whole.
           progress: see `sample`.
         """
-        objects = variation.objects(self.scaled)
-        if objects is not running.objects:
-            running.replace_objects(objects, self.field)
+        self._use_objects(running, variation.objects(self.scaled))
         task = variation.task(self.task)
         bank = variation.bank(self)
         to_stress = min(plan.total, stressed) if running.stressable else 0

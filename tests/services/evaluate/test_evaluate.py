@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import json
+import math
 import types
 
 import numpy as np
@@ -14,10 +15,12 @@ import pytest
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.store import Catalogue
 from congrasp.common.policy import bundle as bundles
+from congrasp.common.runtime.engines import ENGINES
 from congrasp.common.task.sampling import cache as bank_cache
 from congrasp.services.cli.main import load
 from congrasp.services.evaluate import episodes as simulation
 from congrasp.services.evaluate import plan, references
+from congrasp.services.evaluate.episodes import Episodes
 from congrasp.services.evaluate.experiment import Experiment, Variation
 from congrasp.services.evaluate.heading_rules import heading_rules
 from congrasp.services.evaluate.paper.figures import CENTER_GROUP
@@ -206,6 +209,37 @@ def test_rows_are_independent_and_kept_episodes_are_drawn(experiment):
     assert len(causes) == len(heading.examples(2, 2))
     assert sheet.shape[0] > 2 * 225
     assert sheet.shape[1] > 5 * 300
+
+
+def test_rows_in_common_batches_are_the_same_episodes(experiment, monkeypatch):
+    """As engines on a device run them."""
+    variations = [
+        Variation("affordance"),
+        Center(),
+        Variation(),
+        Load(label="heavy", mass=(2, 2)),
+    ]
+    alone = experiment.run(variations)
+    monkeypatch.setitem(ENGINES, "native", ENGINES["native"]._replace(on_device=True))
+    batches = []
+    run = Episodes.run
+
+    def counted(*arguments, **options):
+        batches.append(arguments)
+        return run(*arguments, **options)
+
+    monkeypatch.setattr(Episodes, "run", counted)
+    progress = []
+    tracked = dataclasses.replace(experiment, track=lambda label, total: progress.append)
+    together = tracked.run(variations)
+    episodes = sum(result.row.episodes for result in alone)
+    assert len(batches) == math.ceil(episodes / EPISODES)
+    assert progress[-1] == episodes
+    assert progress == sorted(progress)
+    for expected, result in zip(alone, together, strict=True):
+        for key, column in expected.sample.values.items():
+            np.testing.assert_array_equal(result.sample.values[key], column, err_msg=key)
+        assert result.row.to_json() == expected.row.to_json()
 
 
 def test_a_stopped_evaluation_resumes_at_its_current_row(experiment, tmp_path, monkeypatch):

@@ -1,0 +1,66 @@
+"""Rows of one task and of the same objects, simulated in common batches.
+
+An engine on a device needs nearly as long for a few hundred worlds as for thousands. Episodes do
+not depend on the others of their batch, so a row has the same episodes as in batches of its own.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+
+import jax
+import numpy as np
+
+from congrasp.actors.initial import InitialConditions
+from congrasp.services.evaluate.episodes import Episodes, Sample, join_samples
+
+
+def run_rows(
+    simulator: Episodes,
+    rows: Sequence[InitialConditions],
+    *,
+    stressed: bool,
+    progress: Callable[[int], None],
+) -> list[Sample]:
+    """Simulates the episodes of several rows.
+
+    Args:
+      simulator: simulator of the rows' task and objects.
+      rows: initial conditions of the episodes of each row.
+      stressed: also simulates the stress test of all episodes (`actors.stress`).
+      progress: called with the number of simulated episodes; those of the running batch count by
+        their share of control steps.
+
+    Returns:
+      The sample of each row.
+    """
+    lengths = [len(row.hold) for row in rows]
+    row_of_episode = np.repeat(np.arange(len(rows)), lengths)
+    samples: list[list[Sample]] = [[] for _ in rows]
+    finished = 0
+    for conditions, count in _batches(rows, simulator.batch):
+
+        def report(share: float, finished: int = finished, count: int = count) -> None:
+            """Counts the episodes of the running batch by their share of control steps."""
+            progress(finished + int(share * count))
+
+        batch = simulator.run(conditions, stressed=stressed, progress=report)
+        row_in_batch = np.full(simulator.batch, -1)
+        row_in_batch[:count] = row_of_episode[finished : finished + count]
+        for row in np.unique(row_in_batch[:count]):
+            samples[row].append(batch.sample.where(row_in_batch == row))
+        finished += count
+        progress(finished)
+    return [join_samples(of_row) for of_row in samples]
+
+
+def _batches(
+    rows: Sequence[InitialConditions], size: int
+) -> Iterator[tuple[InitialConditions, int]]:
+    """Yields the episodes of all rows in batches of `size`, each with the number of its episodes
+    that count: the last batch is padded with repetitions of the last episode.
+    """
+    episodes = jax.tree.map(lambda *columns: np.concatenate(columns), *rows)
+    total = len(episodes.hold)
+    for start in range(0, total, size):
+        indices = np.minimum(np.arange(start, start + size), total - 1)
+        conditions = jax.tree.map(lambda column, indices=indices: column[indices], episodes)
+        yield conditions, min(size, total - start)
