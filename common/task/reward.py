@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from congrasp.common import rotations
 from congrasp.common.hands.spec import Hand
 from congrasp.common.runtime.lazy_jax import jnp
-from congrasp.common.task.constraints import center_fingers, known
+from congrasp.common.task.constraints import center_fingers, known, requested_fingers
 from congrasp.common.task.geometry import FAR, square
 from congrasp.common.task.grip import resistance
 from congrasp.common.task.posture import finger_deviations
@@ -102,9 +102,15 @@ def _grip(scene: Scene, earning: Earning) -> Array:
 
 
 def _posture(scene: Scene, earning: Earning) -> Array:
-    """Mean squared deviation of the fingers from natural postures."""
+    """Mean squared deviation of the fingers from natural postures; 0 where a constraint requests
+    the fingers' angles, which would otherwise be pulled to two postures at once.
+    """
     deviation = finger_deviations(scene.hand, scene.state.q, scene.features.touching)
-    return -jnp.mean(deviation**2, -1)
+    cost = jnp.mean(deviation**2, -1)
+    requested = requested_fingers(scene.task, scene.goal)
+    if requested is None:
+        return -cost
+    return -jnp.where(requested, 0.0, cost)
 
 
 def _object_position(scene: Scene, earning: Earning) -> Array:

@@ -38,6 +38,8 @@ _MAX_TURN = 2 * np.pi  # rad of a wrist hinge
 _CONTACT_SHARES = (0.0, 0.1, 0.5, 1.0)
 """Shares of a hand's contacts that are closed. Some terms need fingers that touch nothing, others
 fingers that press."""
+_ACTIVE_SHARE = 0.75
+"""Share of states in which all constraints are active; in the others none is."""
 _MAX_FORCE = 1e3  # N; terms and observations clip or squash forces far below this
 _FLAGS = ("episode/success", "episode/held", f"episode/{DIVERGED}")
 _MAX_METRIC = 1e6  # limit of an error or a force, in its unit
@@ -141,8 +143,7 @@ def _evaluate(hand: Hand, task: TaskConfig, extremes: _Extremes) -> tuple[Any, A
 
 
 def _extremes(hand: Hand, task: TaskConfig) -> _Extremes:
-    """Random states up to the engines' limits, with random surfaces and goals in which everything
-    is active.
+    """Random states up to the engines' limits, with random surfaces and goals.
 
     The readings before a state belong to other states.
     """
@@ -213,10 +214,11 @@ def _extremes(hand: Hand, task: TaskConfig) -> _Extremes:
 
 
 def _goal(hand: Hand, task: TaskConfig, rng: np.random.Generator) -> Goal:
-    """Random goals in which every constraint is active."""
+    """Random goals, in most of which every constraint is active."""
     symbols = symbol_sizes(hand, task)
     values = {}
     masks: dict[str, np.ndarray] = {}
+    active = rng.random(_STATES) < _ACTIVE_SHARE
     for constraint in known(task):
         arrays = {}
         for name, array in constraint.arrays.items():
@@ -229,7 +231,7 @@ def _goal(hand: Hand, task: TaskConfig, rng: np.random.Generator) -> Goal:
                 arrays[name] = _unit(rng, *shape)
         values[constraint.name] = constraint.goal(**arrays)
         for block in constraint.blocks:
-            masks[block] = np.ones(_STATES, bool)
+            masks[block] = active
     return Goal(values, masks)
 
 

@@ -86,7 +86,7 @@ def check_outputs(call: Any) -> None:
     """Raises a CongraspError for an output that cannot be written, or a picture of another format,
     before the work.
 
-    A command that computes the default of --out checks it itself.
+    A command that requires --out or computes its default checks it itself.
 
     Args:
       call: the command with its arguments bound, a `functools.partial`.
@@ -95,6 +95,8 @@ def check_outputs(call: Any) -> None:
         if name not in _OUTPUT_PARAMETERS or not isinstance(path, pathlib.Path):
             continue
         default = inspect.signature(call.args[0]).parameters[name].default
+        if default is inspect.Parameter.empty:
+            default = None
         if default or name != "out":
             check_output(f"--{name}", path, is_folder=_is_folder(name, default))
         _check_picture(name, path, default)

@@ -1,4 +1,4 @@
-"""Policies of the package and of releases: list them, and download more."""
+"""Policies of the package and of releases: list them, download more, and average some."""
 
 import dataclasses
 import pathlib
@@ -128,6 +128,37 @@ class Get:
         return 0
 
 
+@dataclasses.dataclass(frozen=True)
+class Average:
+    """Average the weights of a policy that was trained further and of the policies before it.
+
+    The mean often keeps what both can do. It needs a training that began with the other policy
+    (--initial): policies of separate trainings have no useful mean. Compare it with both by
+    'congrasp evaluate'.
+
+    Examples:
+      congrasp policies average runs/mine/policy.safetensors human --weights 0.5 0.5
+    """
+
+    policies: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """Policy files, or names of policies ('congrasp policies list'). Task, version and number of
+    steps of the result are those of the first."""
+    weights: tuple[float, ...]
+    """Weight of each policy; their sum is 1."""
+    out: pathlib.Path = pathlib.Path("mean.safetensors")
+    """File to write."""
+
+    def __call__(self) -> int:
+        """Writes the mean."""
+        from congrasp.common.policy.average import average
+        from congrasp.common.policy.bundle import load, save
+        from congrasp.common.policy.pretrained import named_policy
+
+        save(average([load(named_policy(name)) for name in self.policies], self.weights), self.out)
+        say(self.out, f"Try: {shell_command('congrasp', 'evaluate', '--policy', self.out)}")
+        return 0
+
+
 def _size(path: pathlib.Path) -> str:
     """Size of a file."""
     return f"{path.stat().st_size / _MB:.1f} MB"
@@ -153,4 +184,4 @@ def _find(name: str, entries: dict[str, Entry], source: str) -> Entry:
     raise CongraspError(f"The index {source} has no policy '{name}'.", remedy)
 
 
-COMMANDS = {"list": List, "get": Get}
+COMMANDS = {"list": List, "get": Get, "average": Average}

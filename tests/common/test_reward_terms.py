@@ -116,3 +116,16 @@ def test_quantity_changes_only_its_term(name, base):
     after = evaluated(reward_terms, replaced(base_scene, *CASES[name]), RewardWeights())
     assert {other for other, value in after.items() if np.any(value != before[other])} == {name}
     assert np.all(after[name] != before[name])
+
+
+def test_natural_postures_count_only_where_no_pose_is_requested(base):
+    """The index finger is hooked: all its joints are bent by 1.5 rad more than in the open hand,
+    and it touches nothing.
+    """
+    weights = RewardWeights(posture=1.0)
+    hooked = replaced(base[0], "features.touching", np.zeros_like)
+    hooked = replaced(hooked, "state.q", add(1.5, HAND.link_fingers[HAND.joint_links] == 1))
+    free = replaced(hooked, "goal.active.pose_finger", np.zeros_like)
+    requested = replaced(hooked, "goal.active.pose_finger", np.ones_like)
+    assert np.all(evaluated(reward_terms, free, weights)["posture"] < -0.05)
+    assert np.all(evaluated(reward_terms, requested, weights)["posture"] == 0.0)

@@ -94,6 +94,18 @@ def center_fingers(task: TaskSettings, goal: Goal) -> Array | None:
     return functools.reduce(operator.and_, selections)
 
 
+def requested_fingers(task: TaskSettings, goal: Goal) -> Array | None:
+    """(B,) bool: an active constraint requests the angles of all finger joints; None if none of the
+    task's constraints does.
+    """
+    requests = [
+        goal.active[constraint.finger_pose] for constraint in known(task) if constraint.finger_pose
+    ]
+    if not requests:
+        return None
+    return functools.reduce(operator.or_, requests)
+
+
 def error_specs(constraints: Iterable[Constraint]) -> tuple[ErrorSpec, ...]:
     """Errors of several constraints, in order."""
     errors: list[ErrorSpec] = []
@@ -143,5 +155,6 @@ __all__ = [
     "goal_of",
     "known",
     "optional",
+    "requested_fingers",
     "require_known",
 ]

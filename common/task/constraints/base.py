@@ -72,6 +72,11 @@ class Constraint:
     the wrist.
     """
 
+    finger_pose: ClassVar[str] = ""
+    """Block whose activity requests the angles of all finger joints, so that natural postures
+    (`common.task.posture`) count no longer; empty if it requests none.
+    """
+
     region: ClassVar[int] = 0
     """Region of the constraint bank from which its episodes are drawn (0 the whole surface, 1 the
     graspable region).

@@ -86,6 +86,7 @@ class Pose(Constraint):
     blocks = ("pose_finger", "pose_wrist")
     overrides = ("heading", "affordance")
     guides = "pose_wrist"
+    finger_pose = "pose_finger"
     from_reference = True
     harvested = False
     weights = (
