@@ -116,13 +116,13 @@ class Dataset:
         from congrasp.common.policy.pretrained import policy_file
         from congrasp.services.dataset.make import Recipe, shard_objects
         from congrasp.services.evaluate.experiment import Experiment
-        from congrasp.services.evaluate.pools import most_objects
+        from congrasp.services.evaluate.pools import max_objects_with_meshes
 
         objects = self._objects()
         file = policy_file(self.policy, self.hand)
         bundle = bundles.load(file)
         engine = resolve_physics(self.physics)
-        in_range(0, most_objects(engine), "objects", shard=self.shard)
+        in_range(0, max_objects_with_meshes(engine), "objects", shard=self.shard)
         outcomes = dict.fromkeys(self.keep)
         return Recipe(
             experiment=Experiment(bundle, [], physics=engine, seed=self.seed, batch=self.batch),
