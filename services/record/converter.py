@@ -15,7 +15,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.transport.keys import check_name
 from congrasp.common.wire.codec import Message, encode, finite
 from congrasp.common.wire.messages import EVENT, LONGEST_TEXT, METRICS, validate
-from congrasp.services.record.budget import LogBudget, Name
+from congrasp.services.record.budget import LogBudget, Publisher
 from congrasp.services.record.episode_entries import duration, raw_entry, scene_entries
 from congrasp.services.record.writer import (
     ROLLOUT_SCHEMA,
@@ -79,8 +79,8 @@ class Converter:
             raise CongraspError(f"{ascii(kind)[:60]} is not a kind of log message.")
         check_name("role", role)
         check_name("role", name)
-        who = (role, name)
-        self._budget.admit(who)
+        publisher = Publisher(role, name)
+        self._budget.admit(publisher)
         convert = self._kinds[kind]
         try:
             message = Message(message.arrays, finite(message.meta))
@@ -89,12 +89,12 @@ class Converter:
             raise CongraspError(
                 f"It is not a valid {kind} message ({type(error).__name__})."
             ) from None
-        self._budget.charge(who, sum(len(entry.data) for entry in entries))
+        self._budget.charge(publisher, sum(len(entry.data) for entry in entries))
         return entries
 
-    def _forget(self, who: Name) -> None:
+    def _forget(self, publisher: Publisher) -> None:
         """Drops the state of a silent publisher."""
-        role, name = who
+        role, name = publisher
         self._json.forget(f"/metrics/{role}/{name}")
         self._json.forget(f"/version/{role}/{name}")
         self._json.forget(f"/episode/{name}/signals")
