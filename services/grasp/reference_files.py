@@ -20,7 +20,7 @@ from congrasp.services.assets.captures.references import follow_human_wrist
 from congrasp.services.assets.captures.sequence import Dropped
 from congrasp.services.assets.captures.surface import Surface
 from congrasp.services.assets.objects.sizes import size_in_words
-from congrasp.services.grasp.csv_paths import HUGE, read_csv
+from congrasp.services.grasp.csv_paths import MAX_MAGNITUDE, read_csv
 from congrasp.services.grasp.target import Target, unit_vector
 from congrasp.services.grasp.wrist_paths import read_wrist_path
 
@@ -210,12 +210,12 @@ def _json(path: pathlib.Path, keys: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _floats(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """(*shape) numbers below `HUGE`; raises a CongraspError for others."""
+    """(*shape) numbers below `MAX_MAGNITUDE`; raises a CongraspError for others."""
     try:
         array = np.asarray(values, float)
     except (TypeError, ValueError, OverflowError):
         array = np.zeros(0)
-    if array.shape != shape or 0 in shape or not (np.abs(array) < HUGE).all():
+    if array.shape != shape or 0 in shape or not (np.abs(array) < MAX_MAGNITUDE).all():
         raise CongraspError(f"{what} must be {' x '.join(map(str, shape))} finite numbers.")
     return array
 
