@@ -19,7 +19,7 @@ from congrasp.actors.physics.warp_kernels import place
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.locks import try_lock
 from congrasp.common.io.opening import open_to_append
-from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.resources import cores
 from congrasp.common.runtime.stages import stage
 
 Variant = tuple[wp.Module, int]
