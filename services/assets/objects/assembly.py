@@ -204,7 +204,7 @@ def _read(source: Source, options: ImportOptions, notes: list[str]) -> _Files:
     if not pieces and not source.parts:
         visuals = [_object_of_scan(mesh, options, notes) for mesh in visuals]
     if not source.parts:
-        visuals = [repair.closed(mesh, notes) for mesh in visuals]
+        visuals = [repair.close_and_orient(mesh, notes) for mesh in visuals]
     return _Files(pieces, visuals, parts, axis, coloured)
 
 
