@@ -27,8 +27,8 @@ def subdivide(
         same vertices and faces.
 
     Returns:
-      Vertices (V', 3) float32 and faces (F', 3) int32. The vertices of a subdivided mesh are sorted;
-      equal ones are merged, and those without a face are left out.
+      Vertices (V', 3) float32 and faces (F', 3) int32. The vertices of a subdivided mesh are
+      sorted; equal ones are merged, and those without a face are left out.
     """
     if len(faces) >= max_faces:
         return np.asarray(vertices, np.float32), np.asarray(faces, np.int32)
@@ -47,9 +47,8 @@ def bisect_longest(
 ) -> np.ndarray:
     """Bisects triangles at their longest edges until no edge is longer than a limit.
 
-    The surface keeps no gap: an edge that is too long is halved at its middle in both triangles that
-    share it, though not always in the same round. Only `max_triangles` may end the bisection between
-    the two.
+    No gap opens: an edge that is too long is halved at its middle in both triangles that share it,
+    though not always in the same round. Only `max_triangles` may end the bisection between the two.
 
     Args:
       corners: (F, 3, C) positions of the corners, m, and further values, which are interpolated.
