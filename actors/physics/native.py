@@ -50,8 +50,9 @@ class Scene:
 
 
 class EnvInstance:
-    """One environment: a model (base pose, mass, friction and gains differ) and data, with
-    persistent views.
+    """Model and data of one environment, with views of their arrays that stay valid.
+
+    The model is a copy, since base pose, mass, friction and gains differ between environments.
     """
 
     def __init__(self, model: mujoco.MjModel):

@@ -46,7 +46,7 @@ class _Result(NamedTuple):
     """Result of a pool."""
 
     sample: Sample
-    """Its episodes."""
+    """Measures of the pool's episodes; empty if none of its objects could be grasped."""
     objects: list[_ObjectFacts]
     left_out: list[str]
     """Names of objects that could not be used."""
