@@ -84,7 +84,9 @@ def parallel_map(function: Callable[..., Result], *columns: Iterable[Any]) -> li
         return [function(*row) for row in rows]
     outcomes = _helper().run(workers, function, rows)
     if outcomes is None:
-        _log.info("The %d calls run in this process: its workers could not start.", len(rows))
+        _log.info(
+            "%d calls run in this process: workers could not start, or one was killed.", len(rows)
+        )
         return [function(*row) for row in rows]
     results: list[Result] = []
     for row, outcome in zip(rows, outcomes, strict=True):

@@ -92,12 +92,12 @@ def _sources_of(paths: tuple[str, ...], counts: _Counts) -> "list[Source]":
     """Returns the sources of all paths, each once, with names that may repeat; reports and counts
     paths without any.
     """
-    from congrasp.services.assets.objects.sources import find_equally_named_sources
+    from congrasp.services.assets.objects.sources import find_unnumbered_sources
 
     sources: dict[pathlib.Path, Source] = {}
     for path in dict.fromkeys(paths):
         try:
-            for source in find_equally_named_sources(path):
+            for source in find_unnumbered_sources(path):
                 sources.setdefault(source.path.resolve(), source)
         except CongraspError as error:
             report_error(error)

@@ -74,11 +74,11 @@ def find_sources(path: str | os.PathLike[str]) -> list[Source]:
     Raises:
       CongraspError: there is nothing to import.
     """
-    return with_distinct_names(find_equally_named_sources(path))
+    return with_distinct_names(find_unnumbered_sources(path))
 
 
-def find_equally_named_sources(path: str | os.PathLike[str]) -> list[Source]:
-    """Finds the objects at a path as `find_sources` does, but names that repeat stay the same.
+def find_unnumbered_sources(path: str | os.PathLike[str]) -> list[Source]:
+    """Finds the objects at a path as `find_sources` does, without numbers in names that repeat.
 
     Raises:
       CongraspError: there is nothing to import.
