@@ -68,8 +68,8 @@ def evaluate_pools(
     and family.
 
     Args:
-      experiment: policy and settings; `episodes` is the least total number, and every object has
-        the same number.
+      experiment: policy and settings; `episodes` is the least total number. All objects of a pool
+        have the same number of episodes, except those that lie too flat, which have none.
       pools: pools of objects.
       stored: folder for results of pools, from which an evaluation with the same arguments resumes;
         None stores none.
@@ -77,26 +77,26 @@ def evaluate_pools(
     Raises:
       CongraspError: the hand can approach none of the objects.
     """
-    number = len(pools.loaders)
-    episodes_of_object = math.ceil(experiment.episodes / (pools.pool_size * number))
-    total = episodes_of_object * pools.pool_size * number
+    pool_count = len(pools.loaders)
+    episodes_of_object = math.ceil(experiment.episodes / (pools.pool_size * pool_count))
+    total = episodes_of_object * pools.pool_size * pool_count
     advance = experiment.track("Episodes on many objects", total)
     experiment = dataclasses.replace(
         experiment,
         constraints=None,
         episodes=episodes_of_object * pools.pool_size,
-        measured=pools.pool_size * number <= MAX_MEASURED_OBJECTS,
+        measured=pools.pool_size * pool_count <= MAX_MEASURED_OBJECTS,
     )
-    files: list[pathlib.Path | None] = [None] * number
+    files: list[pathlib.Path | None] = [None] * pool_count
     if stored is not None:
         name = experiment.digest(pools.source, pools.pool_size)
-        files = [stored / f"{name}-{n:05d}.safetensors" for n in range(number)]
+        files = [stored / f"{name}-{i:05d}.safetensors" for i in range(pool_count)]
     results = {}
-    for n, file in enumerate(files):
+    for pool_index, file in enumerate(files):
         message = None if file is None else read_kept(file)
         if message is not None:
-            results[n] = _result_of(message)
-    missing = [n for n in range(number) if n not in results]
+            results[pool_index] = _result_of(message)
+    missing = [i for i in range(pool_count) if i not in results]
     with contextlib.ExitStack() as stack, prepare_pools(experiment, pools, missing) as ready:
         running: Episodes | None = None
         for pool in ready:
@@ -107,12 +107,12 @@ def evaluate_pools(
             result = _simulate(running, pool, progress, max(0, MIN_STRESSED_EPISODES - finished))
             if finished:  # forces are read from the first pool
                 result = result._replace(sample=result.sample.without_forces())
-            n = pool.experiment.pool
-            results[n] = result
-            file = files[n]
+            pool_index = pool.experiment.pool
+            results[pool_index] = result
+            file = files[pool_index]
             if file is not None:
-                keep(file, result.message(), number)
-    return _rows([results[n] for n in sorted(results)], experiment)
+                keep(file, result.message(), pool_count)
+    return _rows([results[i] for i in sorted(results)], experiment)
 
 
 def _simulate(
