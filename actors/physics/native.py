@@ -16,8 +16,8 @@ from congrasp.actors.physics.scene import GAINS, MASS_POWERS, TABLE_AWAY, addres
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.runtime.parallel import memory
 from congrasp.common.runtime.physics_library import mujoco
+from congrasp.common.runtime.resources import memory
 from congrasp.common.task.config import TaskConfig
 
 _ENVIRONMENT_BYTES = 860_000
@@ -50,8 +50,9 @@ class Scene:
 
 
 class EnvInstance:
-    """One environment: a model (base pose, mass, friction and gains differ) and data, with
-    persistent views.
+    """Model and data of one environment, with views of their arrays that stay valid.
+
+    The model is a copy, since base pose, mass, friction and gains differ between environments.
     """
 
     def __init__(self, model: mujoco.MjModel):

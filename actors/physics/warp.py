@@ -37,7 +37,7 @@ from congrasp.actors.physics.object_rows import ObjectRows
 from congrasp.actors.physics.scene import SENSOR_WIDTH, addresses
 from congrasp.actors.physics.slots import mesh_count
 from congrasp.actors.physics.warp_buffers import WarpBuffers
-from congrasp.actors.physics.warp_kernels import OBJECT_FIELDS, Objects
+from congrasp.actors.physics.warp_kernels import OBJECT_FIELDS, ObjectFields
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects import procedural
 from congrasp.common.objects.spec import GraspObject
@@ -55,9 +55,9 @@ _buffers: "weakref.WeakValueDictionary[int, WarpBuffers]" = weakref.WeakValueDic
 _handles = itertools.count()
 
 
-def objects_on(device: wp.Device, rows: dict[str, np.ndarray]) -> Objects:
+def objects_on(device: wp.Device, rows: dict[str, np.ndarray]) -> ObjectFields:
     """Transfers rows of objects to a device."""
-    objects = Objects()
+    objects = ObjectFields()
     for name, dtype in OBJECT_FIELDS.items():
         value = rows[name]
         if name == "geom_aabb":

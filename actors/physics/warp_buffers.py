@@ -11,12 +11,12 @@ from mujoco.mjx.third_party import mujoco_warp
 from congrasp.actors.physics.scene import TABLE_AWAY, Addresses
 from congrasp.actors.physics.warp_build import Variant, build_kernels, variants_of
 from congrasp.actors.physics.warp_kernels import (
-    DATA_LEAVES,
-    MODEL_LEAVES,
-    Leaves,
-    Objects,
-    count,
-    place,
+    DATA_FIELDS,
+    MODEL_FIELDS,
+    EnvironmentFields,
+    ObjectFields,
+    record_occupancy,
+    set_environments,
 )
 from congrasp.common.runtime.physics_library import mujoco
 
@@ -57,12 +57,12 @@ class WarpBuffers:
             substeps * batch,
         ]
         self.limits = np.array(capacities, np.float32)
-        """(3,) capacities of contacts and constraint rows, and physics steps of all environments in
-        a control step.
+        """(3,) limits of the occupancy's entries (`warp_kernels.CONTACTS` and following): contacts,
+        constraint rows, and physics steps of all environments in a control step.
         """
         with wp.ScopedDevice(device):
             # A single row would mark the field as shared, and meshes could then never be absent.
-            self._model = mujoco_warp.put_model(model, dict.fromkeys(MODEL_LEAVES, max(batch, 2)))
+            self._model = mujoco_warp.put_model(model, dict.fromkeys(MODEL_FIELDS, max(batch, 2)))
             self._data = mujoco_warp.make_data(
                 model,
                 batch,
@@ -70,23 +70,23 @@ class WarpBuffers:
                 njmax=CONSTRAINTS_PER_ENVIRONMENT,
             )
             self._occupancy = wp.zeros(3, dtype=int)
-            self._leaves = leaves = Leaves()
-            for name in MODEL_LEAVES:
-                setattr(leaves, name, getattr(self._model, name))
-            for name in DATA_LEAVES:
-                setattr(leaves, name, getattr(self._data, name))
-            leaves.geoms = wp.array(geoms, dtype=int)
-            leaves.motors = wp.array(where.motors, dtype=int)
+            self._environments = environments = EnvironmentFields()
+            for name in MODEL_FIELDS:
+                setattr(environments, name, getattr(self._model, name))
+            for name in DATA_FIELDS:
+                setattr(environments, name, getattr(self._data, name))
+            environments.slot_geoms = wp.array(geoms, dtype=int)
+            environments.motors = wp.array(where.motors, dtype=int)
             gain = model.actuator_gainprm[where.motors, :1]
             bias = model.actuator_biasprm[where.motors, 1:3]
-            leaves.gains = wp.array(np.concatenate([gain, bias], -1), dtype=wp.vec3)
-        leaves.object_body = where.object_body
-        leaves.object_dof = where.object_qvel[0]
-        leaves.base_body = where.base_body
-        leaves.table = where.table_mocap
-        leaves.anchor = where.anchor_mocap
-        leaves.weld = where.weld
-        leaves.table_away = TABLE_AWAY[2]
+            environments.nominal_gains = wp.array(np.concatenate([gain, bias], -1), dtype=wp.vec3)
+        environments.object_body = where.object_body
+        environments.object_dof = where.object_qvel[0]
+        environments.base_body = where.base_body
+        environments.table_mocap = where.table_mocap
+        environments.anchor_mocap = where.anchor_mocap
+        environments.anchor_weld = where.weld
+        environments.absent_table_height = TABLE_AWAY[2]
         # The kernels print every overflow; thousands of environments would flood the log.
         self._model.opt.warn_overflow = 0
         self._with_sensors = self._model.opt.disableflags
@@ -95,7 +95,7 @@ class WarpBuffers:
         self._kernels = builder.submit(self._load_kernels)
         wp.synchronize_device(device)  # JAX's stream does not wait for Warp's
 
-    def fill(self, objects: Objects, meshes: dict[str, Any]) -> None:
+    def fill(self, objects: ObjectFields, meshes: dict[str, Any]) -> None:
         """Sets the sources of the environments' fields: rows, and the fields of the model with
         their meshes.
         """
@@ -126,8 +126,9 @@ class WarpBuffers:
             (data.ctrl, ctrl),
         ):
             wp.copy(buffer, array)
-        inputs = [*placed, self._objects, self._leaves, self._occupancy]
-        wp.launch(place, (data.nworld, self._leaves.geoms.size), inputs, device=self._device)
+        inputs = [*placed, self._objects, self._environments, self._occupancy]
+        threads = (data.nworld, self._environments.slot_geoms.size)
+        wp.launch(set_environments, threads, inputs, device=self._device)
         self._launch()
         for array, buffer in (
             (qpos, data.qpos),
@@ -193,7 +194,7 @@ class WarpBuffers:
             is_last = left == 0
             model.opt.disableflags = self._with_sensors if is_last else self._without_sensors
             mujoco_warp.step(model, data)
-            counts = [
+            inputs = [
                 data.ncollision,
                 data.nacon,
                 data.nefc,
@@ -201,4 +202,4 @@ class WarpBuffers:
                 model.opt.iterations,
                 self._occupancy,
             ]
-            wp.launch(count, data.nworld, counts, device=self._device)
+            wp.launch(record_occupancy, data.nworld, inputs, device=self._device)

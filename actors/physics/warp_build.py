@@ -15,11 +15,11 @@ from typing import Any, BinaryIO
 
 import warp as wp
 
-from congrasp.actors.physics.warp_kernels import place
+from congrasp.actors.physics.warp_kernels import set_environments
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.locks import try_lock
 from congrasp.common.io.opening import open_to_append
-from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.resources import cores
 from congrasp.common.runtime.stages import stage
 
 Variant = tuple[wp.Module, int]
@@ -62,7 +62,7 @@ def variants_of(device: wp.Device, launch_all: Callable[[], None]) -> list[Varia
     largest kernels, each of which Warp would build for the answer.
     """
     queried: list[Variant] = []
-    launched: list[Variant] = [(place.module, _BLOCK)]
+    launched: list[Variant] = [(set_environments.module, _BLOCK)]
     this_thread = threading.get_ident()
     launch = wp.launch
     launch_tiled = wp.launch_tiled

@@ -41,24 +41,27 @@ from congrasp.common.io.inputs import LONGEST_NAME, read_file
 
 FORMAT = 1
 MAX_BYTES = 1 << 20
-"""Largest size of a hand file in bytes."""
+"""Largest size of a hand file in bytes, and of its text in characters."""
 _SHIPPED = pathlib.Path(__file__).with_name("data")
 _MAX_LINKS = 64
 _MAX_JOINTS = 64
+"""Most joints, couplings or tendons of a hand, or joints of a tendon."""
 _MAX_SHAPES = 16
 """Most capsules, or solids, of a link."""
-_MAX_NUMBER = 1e5
-"""Bound of all numbers; the wrist of a real hand of 7 kg has a gain of 13,000."""
+_MAX_MAGNITUDE = 1e5
+"""Largest magnitude of a number in its unit; the wrist of a real hand of 7 kg has a gain of 13,000
+N/m.
+"""
 _REMEDY = "Make it with 'congrasp hands import', or compare it with docs/add-a-hand.md."
 _ANGLE_TOLERANCE_RAD = 1e-5
 """Tolerance of angles in single precision, rad."""
 _NORM_TOLERANCE = 1e-3
-_TAKEN_LINKS = {"hand_base", "table", "anchor", "object", "hold", "world"}
-_WRIST = {"wrist_x", "wrist_y", "wrist_z", "wrist_rx", "wrist_ry", "wrist_rz"}
-TAKEN_JOINTS = _WRIST | {"object", "hold"}
-"""Names reserved for joints, actuators and equalities of the scene: no joint or tendon may have
-them.
-"""
+"""Tolerance of the norm of axes and quaternions."""
+_RESERVED_LINKS = {"hand_base", "table", "anchor", "object", "hold", "world"}
+"""Names of bodies of the scene, which no link may have."""
+_WRIST_JOINTS = {"wrist_x", "wrist_y", "wrist_z", "wrist_rx", "wrist_ry", "wrist_rz"}
+RESERVED_JOINTS = _WRIST_JOINTS | {"object", "hold"}
+"""Names of joints, actuators and equalities of the scene, which no joint or tendon may have."""
 
 
 def hand_text(hand: Hand) -> str:
@@ -78,7 +81,9 @@ def hand_text(hand: Hand) -> str:
 
 
 def hand_from_text(text: str, source: str = "the hand file") -> Hand:
-    """Returns the hand described by a file's text; the same text gives the same object.
+    """Returns the hand described by a file's text.
+
+    Hands are compared by identity: the last 16 texts give the same object again.
 
     Args:
       text: content of the file.
@@ -101,24 +106,47 @@ def hand_from_text(text: str, source: str = "the hand file") -> Hand:
         raise CongraspError(f"{source} has the format {version!r:.20}, not {FORMAT}.", _REMEDY)
     # Without spaces, since the text is sent with every episode.
     compact = json.dumps({"format": FORMAT, **fields}, separators=(",", ":"))
-    hand, fault = _parse_text(compact)
-    if hand is None or fault:
-        raise CongraspError(f"{source}: {fault}.", _REMEDY)
-    return hand
+    try:
+        return _parse_text(compact)
+    except _HandFault as fault:
+        raise CongraspError(f"{source}: {fault}.", _REMEDY) from None
+
+
+class _HandFault(Exception):
+    """First fault of a hand file, as a phrase."""
 
 
 @functools.lru_cache(maxsize=16)
-def _parse_text(text: str) -> tuple[Hand | None, str]:
-    """Parses a hand file's text; returns the hand, or None and the fault."""
+def _parse_text(text: str) -> Hand:
+    """Parses the text of a hand file.
+
+    Raises:
+      _HandFault: it does not describe a valid hand.
+    """
     fields = json.loads(text)
     del fields["format"]
+    if "text" in fields:  # a field of `Hand`, not of its file
+        raise _HandFault("not a hand, it has an unknown field 'text'")
+    rules = dacite.Config(strict=True, cast=[tuple], type_hooks={float: _number_of})
     try:
-        hand = dacite.from_dict(
-            Hand, {**fields, "text": text}, dacite.Config(strict=True, cast=[tuple, float])
-        )
+        hand = dacite.from_dict(Hand, {**fields, "text": text}, rules)
     except (dacite.DaciteError, TypeError, ValueError, OverflowError) as error:
-        return None, f"not a hand, {str(error)[:200]}"
-    return hand, next(iter(faults(hand)), "")
+        raise _HandFault(f"not a hand, {str(error)[:200]}") from None
+    faults = hand_faults(hand)
+    if faults:
+        raise _HandFault(faults[0])
+    return hand
+
+
+def _number_of(value: object) -> float:
+    """Returns a number of a JSON file as a float.
+
+    Raises:
+      TypeError: it is not a number, but for instance a text or `true`.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError(f"{value!r:.40} is not a number")
+    return float(value)
 
 
 def read_hand(path: pathlib.Path) -> Hand:
@@ -135,7 +163,7 @@ def shipped_hand(name: str) -> Hand:
     return dataclasses.replace(read_hand(_SHIPPED / f"{name}.json"), text="")
 
 
-def faults(hand: Hand) -> list[str]:
+def hand_faults(hand: Hand) -> list[str]:
     """Returns the faults of a hand, one phrase each.
 
     A fault that makes further checks impossible is the last of the list.
@@ -152,14 +180,17 @@ def faults(hand: Hand) -> list[str]:
         faults += _link_faults(hand, i)
     for joint in hand.joints:
         faults += _joint_faults(joint)
-    faults = faults or _coupling_faults(hand)
+    if not faults:
+        faults += _coupling_faults(hand)
     if faults:
         return faults
     faults += _motor_faults(hand)
     faults += _pose_faults(hand, "open", hand.open_pose, hand.q_open)
     faults += _pose_faults(hand, "closed", hand.closed_pose, hand.q_closed)
+    if hand.wide_pose is not None:
+        faults += _pose_faults(hand, "wide", hand.wide_pose, hand.posed(hand.wide_pose))
     faults += _tip_faults(hand)
-    if not min(hand.object_scale, *dataclasses.astuple(hand.wrist)) > 0:
+    if min(hand.object_scale, *dataclasses.astuple(hand.wrist)) <= 0:
         faults.append("the object scale and the numbers of the wrist must be above zero")
     return faults
 
@@ -171,14 +202,15 @@ def _name_faults(hand: Hand) -> list[str]:
     joints = [joint.name for joint in hand.joints]
     if not hand.name.isidentifier() or len(hand.name) > LONGEST_NAME:
         faults.append(
-            f"the name '{hand.name}' has characters other than letters, digits and underscores"
+            f"the name '{hand.name[: LONGEST_NAME + 1]}' must have letters, digits and underscores "
+            f"alone, {LONGEST_NAME} at most, and not begin with a digit"
         )
     counts = Counter(links + joints)
     for name in sorted(counts):
         if counts[name] > 1 or not name:
             faults.append(f"the name '{name}' occurs more than once or is empty")
-    taken = (_TAKEN_LINKS & {*links}) | (TAKEN_JOINTS & {*joints})
-    for name in sorted(taken):
+    reserved = (_RESERVED_LINKS & {*links}) | (RESERVED_JOINTS & {*joints})
+    for name in sorted(reserved):
         faults.append(f"the name '{name}' is taken")
     return faults
 
@@ -199,7 +231,7 @@ def _link_faults(hand: Hand, i: int) -> list[str]:
         faults.append(f"the link '{link.name}' has a solid without a size")
     if not all(_is_unit(solid.quaternion) for solid in link.solids):
         faults.append(f"the link '{link.name}' has a solid whose quaternion is not normalised")
-    if not link.mass > 0 or link.contact_weight < 0:
+    if link.mass <= 0 or link.contact_weight < 0:
         faults.append(
             f"the link '{link.name}' needs a mass above zero and a contact weight of at least zero"
         )
@@ -209,7 +241,7 @@ def _link_faults(hand: Hand, i: int) -> list[str]:
 def _joint_faults(joint: Joint) -> list[str]:
     """Returns the faults of a joint."""
     faults = []
-    if not joint.lower < joint.upper:
+    if joint.lower >= joint.upper:
         faults.append(
             f"the limits {joint.lower:g} and {joint.upper:g} of '{joint.name}' are in the wrong "
             f"order"
@@ -223,7 +255,7 @@ def _joint_faults(joint: Joint) -> list[str]:
 
 def _is_unit(numbers: Sequence[float]) -> bool:
     """True for a vector or quaternion of length one."""
-    return not abs(float(np.linalg.norm(numbers)) - 1) > _NORM_TOLERANCE
+    return abs(float(np.linalg.norm(numbers)) - 1) <= _NORM_TOLERANCE
 
 
 def _motor_faults(hand: Hand) -> list[str]:
@@ -275,8 +307,9 @@ def _coupling_faults(hand: Hand) -> list[str]:
     followers = [coupling.joint for coupling in hand.couplings]
     for coupling in hand.couplings:
         are_joints = coupling.joint in joints and coupling.leader in joints
-        follows_once = followers.count(coupling.joint) == 1 and coupling.leader not in followers
-        if not are_joints or not follows_once:
+        has_one_leader = followers.count(coupling.joint) == 1
+        leader_has_motor = coupling.leader not in followers
+        if not are_joints or not has_one_leader or not leader_has_motor:
             faults.append(
                 f"'{coupling.joint}' cannot follow '{coupling.leader}': one is not a joint, or "
                 f"follows another"
@@ -312,15 +345,15 @@ def _tendon_faults(hand: Hand, tendon: Motor) -> list[str]:
             f"the tendon '{tendon.name}' needs at least two joints and nonzero coefficients"
         )
     names = [other.name for other in hand.tendons]
-    is_taken = tendon.name in TAKEN_JOINTS | {*joints} or names.count(tendon.name) > 1
+    is_taken = tendon.name in RESERVED_JOINTS | {*joints} or names.count(tendon.name) > 1
     if is_taken or not tendon.name:
         faults.append(f"the name '{tendon.name}' of a tendon is taken, or empty")
     return faults
 
 
 def _out_of_bounds(hand: Hand) -> str:
-    """Returns why a hand is not valid at all (numbers that are not finite, too many parts), or an
-    empty string.
+    """Returns the fault of a hand that makes other checks impossible: too many parts, or a number
+    that is not finite; empty without one.
     """
     if len(hand.links) > _MAX_LINKS or len(hand.joints) > _MAX_JOINTS:
         return f"it has more than {_MAX_LINKS} links or {_MAX_JOINTS} joints"
@@ -333,8 +366,10 @@ def _out_of_bounds(hand: Hand) -> str:
     fields = dataclasses.asdict(hand)
     del fields["text"]
     for number in _numbers(fields):
-        if not abs(number) <= _MAX_NUMBER:
-            return f"it holds {number:g}, which is not a finite number of at most {_MAX_NUMBER:g}"
+        if not abs(number) <= _MAX_MAGNITUDE:  # also true for NaN
+            return (
+                f"it holds {number:g}, which is not a finite number of at most {_MAX_MAGNITUDE:g}"
+            )
     return ""
 
 

@@ -25,7 +25,7 @@ from congrasp.common.io.files import cache_folder, keep, read_kept
 from congrasp.common.objects import shapes
 from congrasp.common.objects.spec import PRIMITIVE_SLOTS, GraspObject, Piece
 from congrasp.common.runtime.lazy_trimesh import trimesh
-from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.resources import cores
 from congrasp.common.task.types import Array
 from congrasp.common.wire.codec import Message
 

@@ -43,7 +43,7 @@ class Ending(NamedTuple):
     """End of a child process."""
 
     code: int
-    """Its exit code."""
+    """Exit code of the process."""
     output: bytes
     """Bytes of the captured stream."""
     excess: Excess

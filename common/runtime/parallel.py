@@ -1,137 +1,106 @@
-"""Cores and memory available to this process, and work distributed among processes if that pays for
-starting them.
+"""Calls of a function distributed among processes, if there are enough of them to pay for starting
+the processes.
 """
 
 import concurrent.futures
 import contextlib
 import importlib
-import math
+import logging
 import multiprocessing.connection
 import multiprocessing.spawn
 import os
-import pathlib
-import re
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Sequence
 from multiprocessing.reduction import ForkingPickler
 from typing import IO, Any, NamedTuple, TypeVar
 
-import psutil
-
 from congrasp.common.runtime import platforms
 from congrasp.common.runtime.environment import child_environment
+from congrasp.common.runtime.resources import cores
 
 Result = TypeVar("Result")
-_MIN_CALLS = 64  # with fewer, starting processes takes longer than it saves
+_log = logging.getLogger(__name__)
+_MIN_CALLS = 64
+"""Calls below which starting processes takes longer than it saves."""
 _MIN_CALLS_PER_WORKER = 16
+"""Calls for which one more worker pays; as many workers as cores start, but at least four if
+there are so many cores.
+"""
 _MAX_WORKERS = 16
-_CALLS_PER_CHUNK = 4  # sent to a worker at a time
+_CALLS_PER_CHUNK = 4
+"""Calls that a worker receives at a time."""
 _PRELOADED = ("congrasp.common.objects.procedural", "congrasp.common.task.constraints")
 """Modules imported once, before workers fork; workers import anything else their functions
 need.
 """
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"), "1")
-"""Environment of processes that share the cores: each would otherwise start a thread for every
-core, for products so small that the threads cost several times the work."""
+"""Environment of workers, whatever that of this process: each would otherwise start a thread for
+every core, for products so small that the threads cost several times the work."""
 _LENGTH_BYTES = 8
 """Size of the length before each message."""
-CGROUPS = pathlib.Path("/sys/fs/cgroup")
-"""Folder of the kernel's control groups."""
-CGROUP_MEMBERSHIP = pathlib.Path("/proc/self/cgroup")
-"""File with the control groups of this process."""
 
 
-def cores() -> int:
-    """Number of cores available to this process, by its affinity and the quotas of its control
-    groups, rounded up.
-    """
-    if hasattr(os, "sched_getaffinity"):
-        available: float = len(os.sched_getaffinity(0))
-    else:
-        available = os.cpu_count() or 1
-    for text in _limits("cpu", "cpu.max", "cpu.cfs_quota_us", "cpu.cfs_period_us"):
-        quota, period = text.split()
-        if quota not in ("max", "-1"):
-            available = min(available, int(quota) / int(period))
-    return max(1, math.ceil(available))
+class _Done(NamedTuple):
+    """A call that was made; None stands for one that was not."""
+
+    result: Any
 
 
-def memory() -> int:
-    """Bytes of memory available to this process: free ones, and what the limits of its control
-    groups leave.
-    """
-    used = psutil.Process().memory_info().rss
-    available = psutil.virtual_memory().available
-    for limit in _limits("memory", "memory.max", "memory.limit_in_bytes"):
-        if limit != "max":
-            available = min(available, int(limit) - used)
-    return max(0, available)
+class _Request(NamedTuple):
+    """Calls for the helper process."""
+
+    caller: int
+    """Process id of the caller, with which the workers end."""
+    folder: str
+    """Current folder of the caller."""
+    workers: int
+    """Number of processes."""
+    function: Callable[..., Any]
+    rows: Sequence[tuple[Any, ...]]
+    """Arguments of each call."""
 
 
-def memory_kills() -> int:
-    """Number of processes that the kernel has killed for lack of memory in this control group and
-    those above it.
-    """
-    counters = _limits("memory", "memory.events", "memory.oom_control")
-    counts = [re.search(r"\boom_kill (\d+)", text) for text in counters]
-    return sum(int(count[1]) for count in counts if count)
-
-
-def _limits(controller: str, unified: str, *separate: str) -> Iterator[str]:
-    """Yields the limits of this process's control group and of the groups above it.
-
-    Args:
-      controller: name of the controller.
-      unified: file of the limit in cgroup version 2.
-      separate: its files in version 1, whose texts are joined.
-    """
-    with contextlib.suppress(OSError):
-        for line in CGROUP_MEMBERSHIP.read_text(encoding="utf-8").splitlines():
-            _, controllers, group = line.split(":", 2)
-            if controllers and controller not in controllers.split(","):
-                continue
-            is_version_1 = bool(controllers)
-            mount = CGROUPS / controller if is_version_1 else CGROUPS
-            files = separate if is_version_1 else (unified,)
-            path = pathlib.PurePath(group.lstrip("/"))
-            for folder in (path, *path.parents):
-                with contextlib.suppress(OSError):
-                    yield " ".join(
-                        (mount / folder / file).read_text(encoding="utf-8").strip()
-                        for file in files
-                    )
+_Outcomes = list[_Done | None]
+"""Outcome of each call of a request; None for a call that failed."""
 
 
 def parallel_map(function: Callable[..., Result], *columns: Iterable[Any]) -> list[Result]:
     """`map` over processes, in order; runs in this process if there are few calls or few cores.
 
     The workers are children of a helper process that imports congrasp alone: they never run the
-    caller's `__main__`. What fails there, for instance for something that only this process has
-    registered, runs in this process.
+    caller's `__main__`. Calls that fail there, for instance because they need something that only
+    this process has registered, are repeated here, one after another. An error of the function
+    itself is raised by that repetition.
 
     Args:
       function: a top-level function of a module; it must not use an accelerator.
       columns: arguments, as for `map`.
     """
     rows = list(zip(*columns, strict=True))
-    workers = _workers(len(rows))
+    workers = _worker_count(len(rows))
     if not workers:
         return [function(*row) for row in rows]
+    outcomes = _helper().run(workers, function, rows)
+    if outcomes is None:
+        _log.info(
+            "%d calls run in this process: workers could not start, or one was killed.", len(rows)
+        )
+        return [function(*row) for row in rows]
     results: list[Result] = []
-    for row, outcome in zip(rows, _helper().results(workers, function, rows), strict=True):
-        results.append(function(*row) if outcome is None else outcome[0])
+    for row, outcome in zip(rows, outcomes, strict=True):
+        results.append(function(*row) if outcome is None else outcome.result)
     return results
 
 
 def prepare_workers(calls: int) -> None:
     """Starts the helper process if `calls` calls will need workers: its imports take seconds."""
-    if _workers(calls):
+    if _worker_count(calls):
         _helper().start()
 
 
-def _workers(calls: int) -> int:
+def _worker_count(calls: int) -> int:
     """Number of processes for `calls` calls; 0 if they would cost more than they save."""
     if calls < _MIN_CALLS:
         return 0
@@ -139,12 +108,14 @@ def _workers(calls: int) -> int:
     return workers if workers > 1 else 0
 
 
-class _Running(NamedTuple):
+class _Process(NamedTuple):
     """The helper's process and its standard streams."""
 
     process: subprocess.Popen[bytes]
-    calls: IO[bytes]
+    requests: IO[bytes]
+    """Standard input, for the messages of the caller."""
     answers: IO[bytes]
+    """Standard output, with the messages of the helper."""
 
 
 class _Helper:
@@ -156,57 +127,60 @@ class _Helper:
     """
 
     def __init__(self) -> None:
+        """Does not start the process yet."""
         self._lock = threading.Lock()
-        self._running: _Running | None = None
+        self._process: _Process | None = None
 
     def start(self) -> None:
         """Starts the process if it is not running."""
         with self._lock:
-            self._started()
+            self._ensure_started()
 
-    def results(
-        self, workers: int, function: Callable[..., Result], rows: list[Any]
-    ) -> list[tuple[Result] | None]:
-        """Returns the result of each call, None for those that failed."""
+    def run(
+        self, workers: int, function: Callable[..., Any], rows: Sequence[tuple[Any, ...]]
+    ) -> _Outcomes | None:
+        """Makes calls in worker processes; returns None if these cannot start or were killed."""
         with self._lock:
             try:
-                helper = self._started()
-                _send(helper.calls, (os.getpid(), os.getcwd(), workers, function, rows))
-                return _receive(helper.answers) or [None] * len(rows)
+                request = _Request(os.getpid(), os.getcwd(), workers, function, rows)
+                helper = self._ensure_started()
+                _send(helper.requests, request)
+                outcomes: _Outcomes | None = _receive(helper.answers)
+                return outcomes
             except (OSError, EOFError):  # it cannot start here, or was killed
                 self._stop()
-                return [None] * len(rows)
+                return None
             except BaseException:
                 self._stop()
                 raise
 
-    def _started(self) -> _Running:
-        """The process, which starts if necessary."""
-        if self._running is None:
+    def _ensure_started(self) -> _Process:
+        """Returns the process, and starts it if necessary."""
+        if self._process is None:
             paths = [str(path) for path in sys.path]
             code = f"import sys; sys.path[:] = {paths}; from {__name__} import serve; serve()"
-            environment = child_environment(JAX_PLATFORMS="cpu", PYTHONWARNINGS="ignore")
             process = subprocess.Popen(
                 [multiprocessing.spawn.get_executable(), "-P", "-c", code],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                env={**_ONE_THREAD, **environment},
+                env=child_environment(**_ONE_THREAD, JAX_PLATFORMS="cpu", PYTHONWARNINGS="ignore"),
                 **platforms.separate_session(),  # Ctrl-C on a terminal reaches only the caller
             )
             assert process.stdin is not None and process.stdout is not None
-            self._running = _Running(process, process.stdin, process.stdout)
-        return self._running
+            self._process = _Process(process, process.stdin, process.stdout)
+        return self._process
 
     def _stop(self) -> None:
         """Ends the process; its workers end with it."""
-        if self._running:
-            helper = self._running
-            self._running = None
-            helper.process.kill()
-            for pipe in (helper.calls, helper.answers):
-                with contextlib.suppress(OSError):  # the rest of a message
-                    pipe.close()
-            helper.process.wait()
+        if self._process is None:
+            return
+        helper = self._process
+        self._process = None
+        helper.process.kill()
+        for pipe in (helper.requests, helper.answers):
+            with contextlib.suppress(OSError):  # the rest of a message
+                pipe.close()
+        helper.process.wait()
 
 
 def _send(pipe: IO[bytes], message: Any) -> None:
@@ -227,8 +201,17 @@ def _receive(pipe: IO[bytes]) -> Any:
     Raises:
       EOFError: the process at the other end is gone.
     """
+    return ForkingPickler.loads(_receive_bytes(pipe))
+
+
+def _receive_bytes(pipe: IO[bytes]) -> bytes:
+    """Reads the pickled bytes of a message.
+
+    Raises:
+      EOFError: the process at the other end is gone.
+    """
     length = int.from_bytes(_read(pipe, _LENGTH_BYTES), "little")
-    return ForkingPickler.loads(_read(pipe, length))
+    return _read(pipe, length)
 
 
 def _read(pipe: IO[bytes], count: int) -> bytes:
@@ -243,59 +226,55 @@ _helpers: dict[int, _Helper] = {}
 
 
 def _helper() -> _Helper:
-    """The helper of this process; a fork of it has another."""
+    """Returns the helper of this process; a fork of this process has another."""
     return _helpers.setdefault(os.getpid(), _Helper())
 
 
 def serve() -> None:
-    """Makes the calls of the process at the other end of the standard streams, until that ends.
+    """Answers the requests of the process at the other end of the standard streams, until it ends.
 
-    What the calls print goes to the standard error.
+    The output of the calls goes to the standard error.
     """
-    calls = sys.stdin.buffer
+    requests = sys.stdin.buffer
     with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as answers:
         os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
         for module in _PRELOADED:
             importlib.import_module(module)
         with contextlib.suppress(EOFError, OSError):
             while True:
-                _answer(calls, answers)
+                _answer(requests, answers)
 
 
-def _answer(calls: IO[bytes], answers: IO[bytes]) -> None:
-    """Makes the calls of one message; sends no results if they cannot be made.
+def _answer(requests: IO[bytes], answers: IO[bytes]) -> None:
+    """Answers one request by the outcomes of its calls, or by None if no call can be made.
 
     Raises:
       EOFError, OSError: the process at the other end is gone.
     """
-    try:
-        results = _results(*_receive(calls))
-    except (EOFError, OSError):
-        raise
-    except Exception:  # for instance, a class of the caller's `__main__`
-        results = []
-    _send(answers, results)
+    data = _receive_bytes(requests)
+    outcomes: _Outcomes | None = None
+    # Fails for a class of the caller's `__main__`, for a folder that was deleted, or if a worker
+    # was killed or cannot start.
+    with contextlib.suppress(Exception):
+        outcomes = _run_calls(ForkingPickler.loads(data))
+    _send(answers, outcomes)
 
 
-def _results(
-    caller: int, folder: str, workers: int, function: Callable[..., Result], rows: list[Any]
-) -> list[tuple[Result] | None]:
-    """The result of each call, None for those that failed, by workers that end with the caller and
-    with this process.
-    """
-    os.chdir(folder)
+def _run_calls(request: _Request) -> _Outcomes:
+    """Makes the calls of a request in workers that end with the caller and with this process."""
+    os.chdir(request.folder)
     context = multiprocessing.get_context(platforms.start_method())
     with concurrent.futures.ProcessPoolExecutor(
-        workers, context, platforms.end_with, (caller, os.getpid())
+        request.workers, context, platforms.end_with, (request.caller, os.getpid())
     ) as pool:
-        calls = [(function, row) for row in rows]
+        calls = [(request.function, row) for row in request.rows]
         return list(pool.map(_call, calls, chunksize=_CALLS_PER_CHUNK))
 
 
-def _call(call: tuple[Callable[..., Result], tuple[Any, ...]]) -> tuple[Result] | None:
-    """The result of a call; None if it fails."""
+def _call(call: tuple[Callable[..., Any], tuple[Any, ...]]) -> _Done | None:
+    """Makes a call in a worker; returns None if it fails."""
     function, row = call
     try:
-        return (function(*row),)
+        return _Done(function(*row))
     except Exception:
         return None

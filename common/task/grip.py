@@ -12,8 +12,8 @@ from congrasp.common.task.types import Array, SceneState
 
 _SAFETY = 2.0
 """Ratio of resistance to load above which more earns nothing."""
-_LEAST_LEVER = 0.01
-"""Lever arm of the weight that is always resisted, m."""
+_MIN_LEVER_M = 0.01
+"""Shortest lever arm of the weight: a grip must resist its torque in any case."""
 
 
 class ObjectLoad(NamedTuple):
@@ -51,7 +51,7 @@ def resistance(state: SceneState, load: ObjectLoad, counts: Array) -> Array:
     lever = jnp.linalg.norm((state.object_position - center)[:, :2], axis=-1)
 
     wanted_force = _SAFETY * load.weight
-    wanted_torque = wanted_force * jnp.maximum(lever, _LEAST_LEVER)
+    wanted_torque = wanted_force * jnp.maximum(lever, _MIN_LEVER_M)
     carries = jnp.minimum(load.friction * total / wanted_force, 1.0)
     resists = jnp.minimum(torque / wanted_torque, 1.0)
     return jnp.where(total > 0.0, (carries + resists) / 2.0, 0.0)

@@ -34,8 +34,8 @@ _DISTAL_RATIO = 2.0 / 3.0
 _DISTAL_SLACK = 0.35
 """Deviation from the coupling of DIP and PIP that people show, rad: contacts extend the last
 joint."""
-_MOST = 1.0
-"""Deviation of one finger above which the measure does not grow, rad."""
+_MAX_DEVIATION_RAD = 1.0
+"""Deviation of one finger above which the measure does not grow."""
 
 
 class FingerJoints(NamedTuple):
@@ -100,7 +100,7 @@ def finger_deviations(hand: Hand, q: Array, touching: Array) -> Array:
         coupled = _DISTAL_RATIO * q[:, joints.proximal]
         off = jnp.maximum(jnp.abs(q[:, joints.distal] - coupled) - _DISTAL_SLACK, 0.0)
         deviation = deviation.at[:, joints.distal_finger].add(off)
-    return jnp.minimum(deviation[:, 1:], _MOST)
+    return jnp.minimum(deviation[:, 1:], _MAX_DEVIATION_RAD)
 
 
 def _idle_deviations(hand: Hand, q: Array, touching: Array) -> Array:

@@ -20,7 +20,7 @@ from rich.table import Table
 
 from congrasp.common.config import RunConfig
 from congrasp.common.errors import CongraspError, TransportError
-from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.resources import cores
 from congrasp.learner.run_directory import create_run
 from congrasp.services.train.accelerators import engine_of, leave_gpus_to
 from congrasp.services.train.launch import Launch, LearnerOptions, Plan

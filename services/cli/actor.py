@@ -11,7 +11,7 @@ import tyro
 from congrasp.actors.physics import PhysicsName
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.journal import AUDIT, Journal, user_journal
-from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.resources import cores
 from congrasp.common.transport import urls
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import process_name

@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 
 from congrasp.actors.physics import PhysicsName
-from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.resources import cores
 from congrasp.services.train.presets import get_preset
 
 

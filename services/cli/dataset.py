@@ -82,7 +82,7 @@ class Dataset:
         part, parts = _part(self.part)
         recipe = self._recipe()
         pools = pools_of(recipe)
-        shards = Shards(self.out, len(pools.make), recipe.columns)
+        shards = Shards(self.out, len(pools.loaders), recipe.columns)
         facts = {"licence": self.licence, **provenance()}
         finished = shards.finished(recipe.about)
         if (self.out / CARD).exists():
@@ -91,7 +91,7 @@ class Dataset:
         of_part = range(part, shards.total, parts)
         missing = [number for number in of_part if number not in finished]
         with tracked() as track:
-            objects = min(len(recipe.objects), pools.size * len(missing))
+            objects = min(len(recipe.objects), pools.pool_size * len(missing))
             advance = track("Episodes", objects * self.per_object)
             make(recipe, shards, pools, missing, advance)
         card = write_card(shards, recipe.about, facts)
@@ -116,13 +116,13 @@ class Dataset:
         from congrasp.common.policy.pretrained import policy_file
         from congrasp.services.dataset.make import Recipe, shard_objects
         from congrasp.services.evaluate.experiment import Experiment
-        from congrasp.services.evaluate.pools import most_objects
+        from congrasp.services.evaluate.pools import max_objects_with_meshes
 
         objects = self._objects()
         file = policy_file(self.policy, self.hand)
         bundle = bundles.load(file)
         engine = resolve_physics(self.physics)
-        in_range(0, most_objects(engine), "objects", shard=self.shard)
+        in_range(0, max_objects_with_meshes(engine), "objects", shard=self.shard)
         outcomes = dict.fromkeys(self.keep)
         return Recipe(
             experiment=Experiment(bundle, [], physics=engine, seed=self.seed, batch=self.batch),

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from congrasp.common.objects.spec import GraspObject
     from congrasp.services.evaluate.experiment import Experiment, Track
     from congrasp.services.evaluate.lineup import Entrant, Lineup
-    from congrasp.services.evaluate.pools import Pools
+    from congrasp.services.evaluate.pools import PoolLoaders
     from congrasp.services.evaluate.scores import Row
     from congrasp.services.evaluate.tables import Evaluation
 
@@ -162,7 +162,7 @@ class Evaluate:
                 "Pass the objects' folder with --objects.",
             )
 
-    def _many_objects(self, engine: PhysicsName) -> "Pools | None":
+    def _many_objects(self, engine: PhysicsName) -> "PoolLoaders | None":
         """Returns the pools of the table `objects`; None if it is not requested."""
         from congrasp.services.evaluate import exams, pools
 

@@ -13,7 +13,7 @@ from congrasp.common.hands import HANDS, SUFFIX, get_hand, hands_folder, own_han
 from congrasp.common.hands.files import hand_text
 from congrasp.common.hands.meshes import load_meshes, save_meshes
 from congrasp.common.io.files import check_output, write_atomically
-from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.resources import cores
 from congrasp.common.shell import shell_command
 from congrasp.services.cli.console import in_range, say, show_table
 from congrasp.services.ops.logs import announce_progress

@@ -31,7 +31,9 @@ class _Counts:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of the command."""
+        """Exit code of the command: 2 if something could not be imported, 1 if a shape is
+        unreliable, else 0.
+        """
         if self.failed:
             return 2
         return 1 if self.unreliable else 0
@@ -40,69 +42,74 @@ class _Counts:
 def import_meshes(
     paths: Annotated[tuple[str, ...], tyro.conf.Positional],
     out: pathlib.Path = pathlib.Path("objects"),
-    mesh: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(),  # noqa: B008
+    conversion: Annotated[ImportOptions, tyro.conf.OmitArgPrefixes] = ImportOptions(),  # noqa: B008
 ) -> int:
     """Import objects from meshes: decompose and weigh them, find their resting poses, and store
     them in a folder.
 
     A path is a mesh file (STL, OBJ, PLY, GLB), a folder with `graspable.*` and `non_graspable.*`, a
     folder with convex pieces `contact*`, `<name>.*` and `<name>_<part>.*`, or a folder of such
-    files and folders. The exit code is 1 if a shape is unreliable: its pieces are more than 5 mm or
-    half of its volume off.
+    files and folders.
+
+    The exit code is 2 if something could not be imported, and else 1 if a shape is unreliable: its
+    pieces are more than 5 mm or half of its volume off.
 
     Args:
       paths: Mesh files and folders.
       out: Folder for the objects.
-      mesh: Conversion of meshes to objects.
+      conversion: Conversion of meshes to objects.
 
     Examples:
       congrasp objects import examples/mug.obj
       congrasp objects import scans/ --unit mm --density 300 --out my-objects
     """
     from congrasp.services.assets.objects.meshes import import_sources
-    from congrasp.services.assets.objects.sources import distinct
+    from congrasp.services.assets.objects.sources import with_distinct_names
 
     if not paths:
         raise CongraspError("There is nothing to import.", "Pass mesh files or folders.")
     counts = _Counts()
     sources = _sources_of(paths, counts)
     catalogue = Catalogue(out)
-    renamed = distinct(sources)
+    renamed = with_distinct_names(sources)
     _report_new_names(sources, renamed)
     with bars() as progress:
-        task = progress.add_task("Importing", total=len(renamed))
-        for _, result in import_sources(renamed, mesh):
-            if isinstance(result, CongraspError):
-                report_error(result)
+        bar = progress.add_task("Importing", total=len(renamed))
+        for _index, imported in import_sources(renamed, conversion):  # in the order of completion
+            if isinstance(imported, CongraspError):
+                report_error(imported)
                 counts.failed += 1
             else:
-                _store(result, catalogue, out)
+                _store(imported, catalogue, out)
                 counts.imported += 1
-                counts.unreliable += not result.shape_reliable
-            progress.advance(task)
+                counts.unreliable += not imported.shape_reliable
+            progress.advance(bar)
     _report_total(counts, out)
     return counts.exit_code
 
 
 def _sources_of(paths: tuple[str, ...], counts: _Counts) -> "list[Source]":
-    """Returns the sources of all paths; reports and counts paths without any."""
-    from congrasp.services.assets.objects.sources import find_sources
+    """Returns the sources of all paths, each once, with names that may repeat; reports and counts
+    paths without any.
+    """
+    from congrasp.services.assets.objects.sources import find_unnumbered_sources
 
-    sources = []
+    sources: dict[pathlib.Path, Source] = {}
     for path in dict.fromkeys(paths):
         try:
-            sources += find_sources(path)
+            for source in find_unnumbered_sources(path):
+                sources.setdefault(source.path.resolve(), source)
         except CongraspError as error:
             report_error(error)
             counts.failed += 1
-    return sources
+    return list(sources.values())
 
 
 def _report_new_names(sources: "Sequence[Source]", renamed: "Sequence[Source]") -> None:
-    """Prints the name of each source that shares its original name with another."""
-    for source, result in zip(sources, renamed, strict=True):
-        if result.name != source.name:
-            say(f"{result.name}: that is {result.path}, for there is another {source.name}.")
+    """Prints the new name of each source whose name an earlier one has."""
+    for source, new in zip(sources, renamed, strict=True):
+        if new.name != source.name:
+            say(f"{new.path} is stored as {new.name}: another object has the name {source.name}.")
 
 
 def _store(obj: "GraspObject", catalogue: Catalogue, folder: pathlib.Path) -> None:
@@ -116,7 +123,7 @@ def _store(obj: "GraspObject", catalogue: Catalogue, folder: pathlib.Path) -> No
     say(f"{obj.name}: {size_in_words(sides)}.")
     say(*(f"{obj.name}: {note}." for note in obj.notes))
     if not obj.shape_reliable:
-        print(f"{obj.name}: its shape is unreliable. Repair the mesh, or raise --max-pieces.")
+        say(f"{obj.name}: its shape is unreliable. Repair the mesh, or raise --max-pieces.")
 
 
 def _report_total(counts: _Counts, folder: pathlib.Path) -> None:
@@ -127,4 +134,4 @@ def _report_total(counts: _Counts, folder: pathlib.Path) -> None:
     unreliable = ""
     if counts.unreliable:
         unreliable = f", {counts.unreliable} of them with an unreliable shape"
-    print(f"{counts.imported} of {total} imported to {folder}{unreliable}.")
+    say(f"{counts.imported} of {total} imported to {folder}{unreliable}.")

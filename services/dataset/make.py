@@ -36,7 +36,7 @@ from congrasp.services.dataset.shards import Shards
 from congrasp.services.evaluate.episodes import Episodes
 from congrasp.services.evaluate.experiment import Experiment
 from congrasp.services.evaluate.plan import batches, plan_row
-from congrasp.services.evaluate.pools import Pool, Pools, listed_pools, load_pools
+from congrasp.services.evaluate.pools import PoolLoaders, PreparedPool, listed_pools, prepare_pools
 
 FORMAT = 1
 _T = TypeVar("_T")
@@ -121,7 +121,7 @@ def shard_objects(per_object: int) -> int:
     return max(1, min(_MAX_SHARD_EPISODES // per_object, _MAX_SHARD_OBJECTS))
 
 
-def pools_of(recipe: Recipe) -> Pools:
+def pools_of(recipe: Recipe) -> PoolLoaders:
     """The objects of each shard."""
     return listed_pools(recipe.objects, recipe.shard, recipe.options)
 
@@ -129,7 +129,7 @@ def pools_of(recipe: Recipe) -> Pools:
 def make(
     recipe: Recipe,
     shards: Shards,
-    pools: Pools,
+    pools: PoolLoaders,
     numbers: Sequence[int],
     progress: Callable[[int], None] = lambda episodes: None,
 ) -> None:
@@ -146,7 +146,7 @@ def make(
     done = 0
     with (
         contextlib.ExitStack() as stack,
-        load_pools(recipe.template, pools, numbers) as prepared_pools,
+        prepare_pools(recipe.template, pools, numbers) as prepared_pools,
     ):
         running: Episodes | None = None
         for pool in prepared_pools:
@@ -154,7 +154,7 @@ def make(
             columns = grasp_columns(experiment.hand, experiment.task)
             counts: _Counts = collections.defaultdict(collections.Counter)
             parts = [_no_rows(columns)]
-            if pool.real:
+            if pool.real_count:
                 if running:
                     running.replace_objects(experiment.scaled, experiment.field)
                 else:
@@ -174,7 +174,9 @@ def make(
                 "left_out": pool.left_out,
             }
             grasps = table(columns, _joined(parts), about)
-            objects = table(object_columns(), object_rows(experiment.scaled[: pool.real]), about)
+            objects = table(
+                object_columns(), object_rows(experiment.scaled[: pool.real_count]), about
+            )
             shards.write(experiment.pool, grasps, objects)
 
 
@@ -192,7 +194,7 @@ def _joined(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 
 def _initial_conditions(
-    pool: Pool, shares: Mapping[str, int]
+    pool: PreparedPool, shares: Mapping[str, int]
 ) -> tuple[list[InitialConditions], dict[str, np.ndarray]]:
     """Initial conditions of the real objects' episodes under each set of constraints, and columns
     (E,) of all of them.
@@ -210,7 +212,9 @@ def _initial_conditions(
             plan = plan_row(experiment.task, bank, experiment.scaled, constraints, total)
         except CongraspError:
             continue  # no object allows them
-        is_real = (plan.episodes.episode_numbers < share) & (plan.episodes.objects < pool.real)
+        is_real = (plan.episodes.episode_numbers < share) & (
+            plan.episodes.objects < pool.real_count
+        )
         plan = plan._replace(episodes=_selected(plan.episodes, is_real))
         for batch, count in batches(
             experiment.hand, experiment.task, bank, plan, experiment.seed, total
@@ -235,7 +239,10 @@ def _selected(tree: _T, rows: Any) -> _T:
 
 
 def _episodes(
-    running: Episodes, pool: Pool, shares: Mapping[str, int], progress: Callable[[int], None]
+    running: Episodes,
+    pool: PreparedPool,
+    shares: Mapping[str, int],
+    progress: Callable[[int], None],
 ) -> Iterator[dict[str, np.ndarray]]:
     """Yields columns of the real objects' episodes, batch by batch; a batch holds episodes under
     any constraints.

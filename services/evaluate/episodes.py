@@ -24,7 +24,7 @@ from congrasp.common.objects.distance import DistanceField
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy.bundle import PolicyBundle, acting
 from congrasp.common.runtime.engines import PhysicsName
-from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.resources import cores
 from congrasp.common.task import plausibility
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint

@@ -27,7 +27,7 @@ from congrasp.services.evaluate.experiment import (
     advance_from,
 )
 from congrasp.services.evaluate.object_groups import object_groups
-from congrasp.services.evaluate.pools import Pool, Pools, load_pools
+from congrasp.services.evaluate.pools import PoolLoaders, PreparedPool, prepare_pools
 from congrasp.services.evaluate.scores import Row, RowDescription, summarise
 
 
@@ -46,7 +46,7 @@ class _Result(NamedTuple):
     """Result of a pool."""
 
     sample: Sample
-    """Its episodes."""
+    """Measures of the pool's episodes; empty if none of its objects could be grasped."""
     objects: list[_ObjectFacts]
     left_out: list[str]
     """Names of objects that could not be used."""
@@ -62,14 +62,14 @@ class _Result(NamedTuple):
 
 
 def evaluate_pools(
-    experiment: Experiment, pools: Pools, stored: pathlib.Path | None = None
+    experiment: Experiment, pools: PoolLoaders, stored: pathlib.Path | None = None
 ) -> list[Row]:
     """Evaluates rows of the heading constraint on unseen geometry: all objects, then by size, mass
     and family.
 
     Args:
-      experiment: policy and settings; `episodes` is the least total number, and every object has
-        the same number.
+      experiment: policy and settings; `episodes` is the least total number. All objects of a pool
+        have the same number of episodes, except those that lie too flat, which have none.
       pools: pools of objects.
       stored: folder for results of pools, from which an evaluation with the same arguments resumes;
         None stores none.
@@ -77,59 +77,59 @@ def evaluate_pools(
     Raises:
       CongraspError: the hand can approach none of the objects.
     """
-    number = len(pools.make)
-    episodes_of_object = math.ceil(experiment.episodes / (pools.size * number))
-    total = episodes_of_object * pools.size * number
+    pool_count = len(pools.loaders)
+    episodes_of_object = math.ceil(experiment.episodes / (pools.pool_size * pool_count))
+    total = episodes_of_object * pools.pool_size * pool_count
     advance = experiment.track("Episodes on many objects", total)
     experiment = dataclasses.replace(
         experiment,
         constraints=None,
-        episodes=episodes_of_object * pools.size,
-        measured=pools.size * number <= MAX_MEASURED_OBJECTS,
+        episodes=episodes_of_object * pools.pool_size,
+        measured=pools.pool_size * pool_count <= MAX_MEASURED_OBJECTS,
     )
-    files: list[pathlib.Path | None] = [None] * number
+    files: list[pathlib.Path | None] = [None] * pool_count
     if stored is not None:
-        name = experiment.digest(pools.source, pools.size)
-        files = [stored / f"{name}-{n:05d}.safetensors" for n in range(number)]
+        name = experiment.digest(pools.source, pools.pool_size)
+        files = [stored / f"{name}-{i:05d}.safetensors" for i in range(pool_count)]
     results = {}
-    for n, file in enumerate(files):
+    for pool_index, file in enumerate(files):
         message = None if file is None else read_kept(file)
         if message is not None:
-            results[n] = _result_of(message)
-    missing = [n for n in range(number) if n not in results]
-    with contextlib.ExitStack() as stack, load_pools(experiment, pools, missing) as ready:
+            results[pool_index] = _result_of(message)
+    missing = [i for i in range(pool_count) if i not in results]
+    with contextlib.ExitStack() as stack, prepare_pools(experiment, pools, missing) as ready:
         running: Episodes | None = None
         for pool in ready:
-            if pool.real and not running:
+            if pool.real_count and not running:
                 running = stack.enter_context(pool.experiment.simulator())
             finished = sum(result.episodes for result in results.values())
             progress = functools.partial(advance_from, advance, finished)
             result = _simulate(running, pool, progress, max(0, MIN_STRESSED_EPISODES - finished))
             if finished:  # forces are read from the first pool
                 result = result._replace(sample=result.sample.without_forces())
-            n = pool.experiment.pool
-            results[n] = result
-            file = files[n]
+            pool_index = pool.experiment.pool
+            results[pool_index] = result
+            file = files[pool_index]
             if file is not None:
-                keep(file, result.message(), number)
-    return _rows([results[n] for n in sorted(results)], experiment)
+                keep(file, result.message(), pool_count)
+    return _rows([results[i] for i in sorted(results)], experiment)
 
 
 def _simulate(
-    running: Episodes | None, pool: Pool, progress: Callable[[int], None], stressed: int
+    running: Episodes | None, pool: PreparedPool, progress: Callable[[int], None], stressed: int
 ) -> _Result:
     """Simulates the episodes of a pool, if it has objects."""
-    if not running or not pool.real:
+    if not running or not pool.real_count:
         return _Result(Sample({}, np.zeros(0), np.zeros(0)), [], pool.left_out)
     experiment = pool.experiment
     row = Variation()
     plan = experiment.plan(row)
     sample = experiment.sample(running, row, plan, progress, stressed=stressed)
     facts = []
-    for obj in experiment.scaled[: pool.real]:
+    for obj in experiment.scaled[: pool.real_count]:
         largest_side = float(np.ptp(obj.visual_vertices, axis=0).max())
         facts.append(_ObjectFacts(obj.name, largest_side, float(obj.mass), obj.family))
-    not_padding = sample.values["object_index"] < pool.real
+    not_padding = sample.values["object_index"] < pool.real_count
     return _Result(sample.where(not_padding), facts, pool.left_out)
 
 

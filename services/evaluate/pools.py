@@ -1,7 +1,8 @@
-"""Pools of objects: as many as there is time for, in sets that fit an engine.
+"""Objects of an evaluation or a dataset, divided into pools that an engine can simulate.
 
-Pools have one size, so that no program is compiled again, and only two are in memory: while the
-episodes of one are simulated, the next is made or imported with its constraints.
+All pools of an evaluation have the same size, so that no program is compiled again. Only two are in
+memory: while the episodes of one are simulated, a thread generates or imports the objects of the
+next one and samples their constraints.
 """
 
 import concurrent.futures
@@ -13,19 +14,17 @@ import logging
 import math
 import pathlib
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands.closure import Outline, outline
 from congrasp.common.objects import procedural
-from congrasp.common.objects.pool import object_scale
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.runtime.parallel import parallel_map
 from congrasp.common.runtime.settings import library_settings
-from congrasp.common.task.config import TaskConfig
+from congrasp.common.task.sampling.build import heading_arguments
 from congrasp.common.task.sampling.object_headings import headings_of
 from congrasp.services.assets.objects.named import ObjectAt, load_each, objects_at
 from congrasp.services.assets.objects.options import ImportOptions
@@ -38,196 +37,238 @@ from congrasp.services.evaluate.experiment import (
 
 _MAX_OBJECTS_ON_DEVICE = 4096
 """Most objects of a pool for engines on a device."""
-MAX_OBJECTS_ELSEWHERE = 128
-"""Most objects of a pool for other engines, which compile a scene for each."""
-MAX_OBJECTS_OF_FOLDER = 512
-"""Most objects of a pool of a folder, whose surfaces may be large."""
+MAX_OBJECTS_OFF_DEVICE = 128
+"""Most objects of a pool for other engines, which compile a scene for each object."""
+MAX_OBJECTS_WITH_MESHES = 512
+"""Most objects of a pool of files on any engine, since their surfaces may be large."""
 _UNCHANGED = ImportOptions()
 _log = logging.getLogger(__name__)
 _Item = TypeVar("_Item")
 
 
-class Loaded(NamedTuple):
+class LoadedObjects(NamedTuple):
     """Objects of a pool, and names of those that could not be imported."""
 
     objects: list[GraspObject]
     left_out: list[str]
 
 
-class Pools(NamedTuple):
-    """Objects that are loaded in pools."""
+class PoolLoaders(NamedTuple):
+    """Functions that load the objects of each pool when its turn comes."""
 
     source: str
-    """Identity of the objects, for that of results."""
-    size: int
-    """Objects of a pool; the last pools may have one less."""
-    make: Sequence[Callable[[], Loaded]]
+    """Text that identifies the objects of all pools; part of the key of stored results."""
+    pool_size: int
+    """Number of objects of a pool; the last pools may have one less."""
+    loaders: Sequence[Callable[[], LoadedObjects]]
+    """A function for each pool."""
 
 
-def procedural_pools(count: int, physics: PhysicsName, exam: Exam) -> Pools:
-    """Returns at least `count` procedural objects of an exam, in pools of one size."""
-    number, size = _divide(count, _max_objects(physics))
-    seed = first_seed(exam, number * size)
-    families = procedural.family_turns(number * size, seed, FAMILIES)
-
-    def make(start: int) -> Loaded:
-        seeds = range(seed + start, seed + start + size)
-        return Loaded(parallel_map(procedural.generate, seeds, families[start:][:size]), [])
-
-    starts = range(0, number * size, size)
-    return Pools(f"procedural {seed}", size, [functools.partial(make, start) for start in starts])
-
-
-def folder_pools(path: pathlib.Path, physics: PhysicsName) -> Pools:
-    """The objects of a path, in pools that an engine can take."""
-    objects = objects_at(path)
-    identity = ",".join(f"{obj.name} {obj.digest()}" for obj in objects)
-    return listed_pools(objects, most_objects(physics), source=identity)
-
-
-def most_objects(physics: PhysicsName) -> int:
-    """Most objects of a pool whose surfaces may be large."""
-    return min(_max_objects(physics), MAX_OBJECTS_OF_FOLDER)
-
-
-def _max_objects(physics: PhysicsName) -> int:
-    """Most objects of a pool of procedural objects."""
-    if ENGINES[physics].on_device:
-        return _MAX_OBJECTS_ON_DEVICE
-    return MAX_OBJECTS_ELSEWHERE
-
-
-def listed_pools(
-    objects: Sequence[ObjectAt], most: int, options: ImportOptions = _UNCHANGED, source: str = ""
-) -> Pools:
-    """Objects of different names in pools of at most `most`; meshes are imported when their turn
-    comes, and those that cannot be are left out."""
-    number, size = _divide(len(objects), most)
-
-    def make(part: list[ObjectAt]) -> Loaded:
-        left_out: list[str] = []
-
-        def leave_out(obj: ObjectAt, error: CongraspError) -> None:
-            _log.warning("%s is skipped: %s", obj.name, error)
-            left_out.append(obj.name)
-
-        imported = load_each(part, options, on_error=leave_out)
-        names = [obj.name for obj in part if obj.name not in left_out]
-        renamed = [
-            dataclasses.replace(obj, name=name) for obj, name in zip(imported, names, strict=True)
-        ]
-        return Loaded(renamed, left_out)
-
-    makers = []
-    for indices in np.array_split(np.arange(len(objects)), number):
-        part = [objects[i] for i in indices]
-        makers.append(functools.partial(make, part))
-    return Pools(source, size, makers)
-
-
-def _divide(count: int, most: int) -> tuple[int, int]:
-    """Number and size of pools for `count` objects, at most `most` in each."""
-    number = math.ceil(count / most)
-    return number, math.ceil(count / number)
-
-
-class Pool(NamedTuple):
+class PreparedPool(NamedTuple):
     """A pool that is ready for simulation."""
 
     experiment: Experiment
-    """Its objects are the pool's; those from `real` on are repetitions that pad it. It has none if
-    none remains.
+    """Experiment on the pool's objects. The first `real_count` of its objects are the pool's, and
+    the rest repeats them up to the size of all pools.
     """
-    real: int
+    real_count: int
+    """Number of the pool's objects; 0 if the hand can approach none of them."""
     left_out: list[str]
+    """Names of objects that could not be imported, or that the hand cannot approach."""
+
+
+def procedural_pools(count: int, physics: PhysicsName, exam: Exam) -> PoolLoaders:
+    """Returns at least `count` procedural objects of an exam, in pools of one size."""
+    pool_count, pool_size = _divide(count, _max_procedural_objects(physics))
+    total = pool_count * pool_size
+    seed = first_seed(exam, total)
+    families = procedural.family_turns(total, seed, FAMILIES)
+
+    def load(start: int) -> LoadedObjects:
+        """Generates the pool whose first object has the index `start`."""
+        seeds = range(seed + start, seed + start + pool_size)
+        families_of_pool = families[start:][:pool_size]
+        return LoadedObjects(parallel_map(procedural.generate, seeds, families_of_pool), [])
+
+    loaders = [functools.partial(load, start) for start in range(0, total, pool_size)]
+    return PoolLoaders(f"procedural {seed}", pool_size, loaders)
+
+
+def folder_pools(path: pathlib.Path, physics: PhysicsName) -> PoolLoaders:
+    """Returns the objects of a path, in pools that an engine can simulate."""
+    objects = objects_at(path)
+    identity = ",".join(f"{obj.name} {obj.digest()}" for obj in objects)
+    return listed_pools(objects, max_objects_with_meshes(physics), source=identity)
+
+
+def max_objects_with_meshes(physics: PhysicsName) -> int:
+    """Most objects of a pool whose surfaces may be large."""
+    return min(_max_procedural_objects(physics), MAX_OBJECTS_WITH_MESHES)
+
+
+def _max_procedural_objects(physics: PhysicsName) -> int:
+    """Most objects of a pool of procedural objects, whose surfaces are small."""
+    if ENGINES[physics].on_device:
+        return _MAX_OBJECTS_ON_DEVICE
+    return MAX_OBJECTS_OFF_DEVICE
+
+
+def listed_pools(
+    objects: Sequence[ObjectAt],
+    max_pool_size: int,
+    options: ImportOptions = _UNCHANGED,
+    source: str = "",
+) -> PoolLoaders:
+    """Divides objects into pools of at most `max_pool_size`.
+
+    A pool's files are read or imported when its turn comes. Objects that cannot be imported are
+    left out.
+
+    Args:
+      objects: objects with different names.
+      max_pool_size: most objects of a pool.
+      options: options of the import of meshes.
+      source: see `PoolLoaders.source`.
+    """
+    pool_count, pool_size = _divide(len(objects), max_pool_size)
+    loaders = []
+    for indices in np.array_split(np.arange(len(objects)), pool_count):
+        objects_of_pool = [objects[i] for i in indices]
+        loaders.append(functools.partial(_load_listed, objects_of_pool, options))
+    return PoolLoaders(source, pool_size, loaders)
+
+
+def _load_listed(objects: Sequence[ObjectAt], options: ImportOptions) -> LoadedObjects:
+    """Loads the objects of a pool of `listed_pools`."""
+    left_out: list[str] = []
+
+    def leave_out(obj: ObjectAt, error: CongraspError) -> None:
+        """Records an object that cannot be imported."""
+        _log.warning("%s is skipped: %s", obj.name, error)
+        left_out.append(obj.name)
+
+    imported = load_each(objects, options, on_error=leave_out)
+    # An import names its object by its file, and files of two folders may have the same name.
+    names = [obj.name for obj in objects if obj.name not in left_out]
+    renamed = [
+        dataclasses.replace(obj, name=name) for obj, name in zip(imported, names, strict=True)
+    ]
+    return LoadedObjects(renamed, left_out)
+
+
+def _divide(count: int, max_pool_size: int) -> tuple[int, int]:
+    """Returns the number of pools for `count` objects, which is at least 1, and their size."""
+    pool_count = math.ceil(count / max_pool_size)
+    return pool_count, math.ceil(count / pool_count)
 
 
 @contextlib.contextmanager
-def load_pools(
-    experiment: Experiment, pools: Pools, numbers: Sequence[int]
-) -> Iterator[Iterator[Pool]]:
-    """Yields an experiment on each of some pools, made in a thread while the previous one is in
-    use.
+def prepare_pools(
+    experiment: Experiment, pools: PoolLoaders, pool_indices: Sequence[int]
+) -> Iterator[Iterator[PreparedPool]]:
+    """Context with an iterator over pools, each of which a thread prepares while the previous one
+    is in use.
+
+    Args:
+      experiment: settings of the experiments.
+      pools: all pools.
+      pool_indices: indices of the pools to prepare.
     """
-    with _one_ahead(_load_pools(experiment, pools, numbers)) as ready:
-        yield ready
+    with _one_ahead(_prepare(experiment, pools, pool_indices)) as prepared:
+        yield prepared
 
 
-def _load_pools(experiment: Experiment, pools: Pools, numbers: Sequence[int]) -> Iterator[Pool]:
-    """Yields experiments on pools, with their constraints."""
-    for number in numbers:
-        loaded, left_out = pools.make[number]()
-        of_pool = dataclasses.replace(experiment, pool=number, track=silent)
-        of_pool, approachable = _with_approachable(of_pool, loaded, pools.size)
-        if approachable:
-            _ = of_pool.field  # computed in this thread
-        remaining = {id(obj) for obj in approachable}
-        lost = [obj.name for obj in loaded if id(obj) not in remaining]
-        yield Pool(of_pool, len(approachable), [*left_out, *lost])
+def _prepare(
+    experiment: Experiment, pools: PoolLoaders, pool_indices: Sequence[int]
+) -> Iterator[PreparedPool]:
+    """Yields the experiment on each pool, with its constraints."""
+    for pool_index in pool_indices:
+        loaded, not_imported = pools.loaders[pool_index]()
+        settings = dataclasses.replace(experiment, pool=pool_index, track=silent)
+        on_pool, real_objects = _on_approachable(settings, loaded, pools.pool_size)
+        if real_objects:
+            _ = on_pool.field  # computes the grids now, in this thread
+        real_ids = {id(obj) for obj in real_objects}
+        not_approachable = [obj.name for obj in loaded if id(obj) not in real_ids]
+        yield PreparedPool(on_pool, len(real_objects), [*not_imported, *not_approachable])
 
 
 @contextlib.contextmanager
 def _one_ahead(items: Iterator[_Item]) -> Iterator[Iterator[_Item]]:
-    """Yields the same items, each computed in a thread while the previous one is in use."""
-    following = library_settings()(next)
+    """Context with an iterator over the same items, each of which a thread computes while the
+    previous one is in use.
+    """
+
+    def next_item() -> _Item | None:
+        """Computes the next item; None after the last one."""
+        with library_settings():
+            return next(items, None)
+
     with concurrent.futures.ThreadPoolExecutor(1) as background:
 
-        def taken() -> Iterator[_Item]:
-            coming = background.submit(following, items, None)
-            while (item := coming.result()) is not None:
-                coming = background.submit(following, items, None)
+        def in_turn() -> Iterator[_Item]:
+            """Yields the items, and lets the thread begin with the next one before each."""
+            future = background.submit(next_item)
+            while (item := future.result()) is not None:
+                future = background.submit(next_item)
                 yield item
 
-        yield taken()
+        yield in_turn()
 
 
-def _with_approachable(
-    experiment: Experiment, objects: list[GraspObject], size: int
-) -> tuple[Experiment, list[GraspObject]]:
-    """Returns an experiment on `size` of the objects that the hand can approach in some resting
-    pose, and all these.
+def _on_approachable(
+    experiment: Experiment, objects: Sequence[GraspObject], pool_size: int
+) -> tuple[Experiment, Sequence[GraspObject]]:
+    """Leaves out the objects that the hand cannot approach, and repeats the others up to the size
+    of a pool.
+
+    Every repetition of an object has other random headings. An object is also left out if one of
+    its repetitions cannot be approached. One that lies too flat remains, and no episode draws it.
+
+    Args:
+      experiment: experiment without objects.
+      objects: the pool's objects.
+      pool_size: number of objects of the result.
+
+    Returns:
+      The experiment on `pool_size` objects, with its bank computed, and the objects that remain;
+      both without objects if none can be grasped.
     """
-    while objects:
-        padded = list(itertools.islice(itertools.cycle(objects), size))
-        of_pool = dataclasses.replace(experiment, objects=padded)
+    remaining = list(objects)
+    while remaining:
+        padded = list(itertools.islice(itertools.cycle(remaining), pool_size))
+        on_padded = dataclasses.replace(experiment, objects=padded)
         try:
-            _ = of_pool.bank
-            return of_pool, objects
+            _ = on_padded.bank  # computes the bank
+            return on_padded, remaining
         except CongraspError as error:
-            have_headings = _have_headings(of_pool)
-            if all(have_headings):
-                raise
+            weights = _heading_weights(on_padded)
+            unreachable = {i % len(remaining) for i, w in enumerate(weights) if w is None}
+            if not unreachable and any(weights):
+                raise  # the fault is not one of the objects
             _log.warning("%s", error)
-            approachable = {
-                id(obj)
-                for obj, has_heading in zip(padded, have_headings, strict=True)
-                if has_heading
-            }
-            objects = [obj for obj in objects if id(obj) in approachable]
+            if not unreachable:  # all objects lie too flat
+                break
+        remaining = [obj for i, obj in enumerate(remaining) if i not in unreachable]
     return dataclasses.replace(experiment, objects=()), []
 
 
-def _have_headings(experiment: Experiment) -> list[bool]:
-    """Returns for each object whether the hand can approach it."""
-    task = experiment.task
-    size = len(experiment.objects)
-    return parallel_map(
-        _has_heading,
-        [task] * size,
-        experiment.scaled,
-        [(experiment.seed + experiment.pool, n) for n in range(size)],
-        [object_scale(experiment.hand, task)] * size,
-        itertools.repeat(outline(experiment.hand), size),
-    )
-
-
-def _has_heading(
-    task: TaskConfig, obj: GraspObject, seed: tuple[int, int], scale: float, hand: Outline
-) -> bool:
-    """True if an object has a heading for the hand with this outline, and does not lie too flat for
-    all of them.
+def _heading_weights(experiment: Experiment) -> list[float | None]:
+    """Returns the weight of each object: 0 if it lies too flat; None if the hand cannot approach
+    it in any resting pose.
     """
+    columns = heading_arguments(
+        experiment.hand,
+        experiment.task,
+        experiment.scaled,
+        experiment.seed + experiment.pool,
+    )
+    return parallel_map(_heading_weight, *columns)
+
+
+def _heading_weight(*arguments: Any) -> float | None:
+    """Weight of the object with these arguments of `headings_of`; None if that raises an error."""
     try:
-        return bool(headings_of(task, obj, seed, None, scale, hand)["weight"])
+        return float(headings_of(*arguments)["weight"])
     except CongraspError:
-        return False
+        return None

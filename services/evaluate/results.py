@@ -21,7 +21,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_json
 from congrasp.common.runtime.engines import engine_title
-from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.resources import cores
 from congrasp.services.evaluate.columns import (
     PLAUSIBILITY,
     RATE,

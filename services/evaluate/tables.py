@@ -16,7 +16,7 @@ from congrasp.services.evaluate.experiment import Experiment, Result, Variation
 from congrasp.services.evaluate.heading_rules import HeadingRules, heading_rules
 from congrasp.services.evaluate.many_objects import evaluate_pools
 from congrasp.services.evaluate.plan import from_references
-from congrasp.services.evaluate.pools import Pools
+from congrasp.services.evaluate.pools import PoolLoaders
 from congrasp.services.evaluate.references import reference_policy
 from congrasp.services.evaluate.scores import TABLES, Row, known_rows
 from congrasp.services.evaluate.variations import NOISE, PEERS, SENSING, Center, payload
@@ -51,7 +51,7 @@ class Evaluation(NamedTuple):
 def evaluate_tables(
     experiment: Experiment,
     tables: Sequence[str],
-    pools: Pools | None = None,
+    pools: PoolLoaders | None = None,
     stored: pathlib.Path | None = None,
     *,
     keep: bool = False,

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.episode.episode import Episode
 from congrasp.common.hands.skin import Skin
-from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.resources import cores
 from congrasp.services.export.surfaces import skin_of_motion
 from congrasp.services.viz.camera import Camera, fit
 from congrasp.services.viz.hand_shapes import skin_shape

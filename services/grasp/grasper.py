@@ -20,7 +20,7 @@ from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.request import GraspRequest
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.entry import compiling_entry
-from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.resources import cores
 from congrasp.common.task.constraints import require_known
 from congrasp.common.task.constraints.priority import contradictions, explain
 from congrasp.common.wire.codec import encode

@@ -20,7 +20,7 @@ from congrasp.services.assets.captures.references import follow_human_wrist
 from congrasp.services.assets.captures.sequence import Dropped
 from congrasp.services.assets.captures.surface import Surface
 from congrasp.services.assets.objects.sizes import size_in_words
-from congrasp.services.grasp.csv_paths import HUGE, read_csv
+from congrasp.services.grasp.csv_paths import MAX_MAGNITUDE, read_csv
 from congrasp.services.grasp.target import Target, unit_vector
 from congrasp.services.grasp.wrist_paths import read_wrist_path
 
@@ -30,9 +30,9 @@ _MAX_BYTES = 4 << 20
 
 def read_pose(text: str, target: Target) -> dict[str, np.ndarray]:
     """A reference pose from a motion, a constraint set, or JSON."""
-    path, index = _numbered(text)
+    path, index = _split_number(text)
     if path.suffix == ".npz":
-        motion = _motion(path, target.hand, index)
+        motion = _read_motion(path, target.hand, index)
         last = grasp_part(motion)[1]
         position, quaternion = _wrist_on_object(motion, last)
         return {
@@ -74,21 +74,21 @@ def _finger_angles(joints: Any, hand: Hand, path: pathlib.Path) -> np.ndarray:
 
 def read_path(text: str, target: Target) -> dict[str, np.ndarray]:
     """A wrist trajectory from a motion, a constraint set, CSV, BVH, or JSON."""
-    path, index = _numbered(text)
+    path, index = _split_number(text)
     file, _, joint = text.partition(":")
     if file.lower().endswith(".bvh"):
-        return _recorded(pathlib.Path(file), joint or "RightHand", target)
+        return _path_of_joint(pathlib.Path(file), joint or "RightHand", target)
     if path.suffix == ".npz":
-        motion = _motion(path, target.hand, index)
+        motion = _read_motion(path, target.hand, index)
         first, last = grasp_part(motion)
         position, quaternion = _wrist_on_object(motion, first)
         grasp = slice(first, last + 1)
-        return _resampled(position[grasp], quaternion[grasp], target.waypoints, path)
+        return _resample(position[grasp], quaternion[grasp], target.waypoints, path)
     if path.name.endswith(set_file.SUFFIX):
         arrays = _set_of(path, target, index).arrays
         position = arrays["trajectory/position"][0, index]
         quaternion = arrays["trajectory/quaternion"][0, index]
-        return _resampled(position, quaternion, target.waypoints, path)
+        return _resample(position, quaternion, target.waypoints, path)
     if path.suffix.lower() == ".csv":
         position, quaternion = read_csv(path, _MAX_BYTES)
     else:
@@ -98,11 +98,13 @@ def read_path(text: str, target: Target) -> dict[str, np.ndarray]:
         quaternion = _floats(content["quaternion"], (count, 4), f"'quaternion' of {path}")
     position = target.placed(position)
     target.check_near(position[-1], f"the end of {path}")
-    return _resampled(position, target.turned(quaternion), target.waypoints, path)
+    return _resample(position, target.turned(quaternion), target.waypoints, path)
 
 
-def _recorded(path: pathlib.Path, joint: str, target: Target) -> dict[str, np.ndarray]:
-    """The path of a BVH joint to the frame nearest to the object, cut like captured paths."""
+def _path_of_joint(path: pathlib.Path, joint: str, target: Target) -> dict[str, np.ndarray]:
+    """Returns the path of a BVH joint up to the frame nearest to the object, with waypoints chosen
+    as for captured paths.
+    """
     recorded = read_wrist_path(path, joint=joint)
     position, rotation = follow_human_wrist(target.hand, recorded.position, recorded.rotation)
     position = position + target.obj.origin  # both are upright
@@ -121,16 +123,20 @@ def _recorded(path: pathlib.Path, joint: str, target: Target) -> dict[str, np.nd
     return {"position": places, "quaternion": turns}
 
 
-def _numbered(text: str) -> tuple[pathlib.Path, int]:
-    """The file and the number in FILE or FILE:NUMBER; the number is 0 by default."""
+def _split_number(text: str) -> tuple[pathlib.Path, int]:
+    """Splits FILE:NUMBER into the file and the number, which is 0 for FILE alone."""
     name, colon, number = text.rpartition(":")
     if colon and number.isdecimal() and len(number) < 10:
         return pathlib.Path(name), int(number)
     return pathlib.Path(text), 0
 
 
-def _motion(path: pathlib.Path, hand: Hand, index: int) -> Episode:
-    """The motion in a file; raises a CongraspError for another hand, or an `index` other than 0."""
+def _read_motion(path: pathlib.Path, hand: Hand, index: int) -> Episode:
+    """Reads the motion of a file.
+
+    Raises:
+      CongraspError: it is of another hand, or `index` is not 0, since a file holds one motion.
+    """
     if index:
         raise CongraspError(
             f"{path} holds a single motion, without the number {index}.", f"Remove ':{index}'."
@@ -210,20 +216,37 @@ def _json(path: pathlib.Path, keys: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _floats(values: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """(*shape) numbers below `HUGE`; raises a CongraspError for others."""
+    """Returns numbers as an array of a shape.
+
+    Raises:
+      CongraspError: they have another shape, or one is not a finite number below `MAX_MAGNITUDE`.
+    """
     try:
         array = np.asarray(values, float)
     except (TypeError, ValueError, OverflowError):
         array = np.zeros(0)
-    if array.shape != shape or 0 in shape or not (np.abs(array) < HUGE).all():
+    if array.shape != shape or 0 in shape or not (np.abs(array) < MAX_MAGNITUDE).all():
         raise CongraspError(f"{what} must be {' x '.join(map(str, shape))} finite numbers.")
     return array
 
 
-def _resampled(
+def _resample(
     position: np.ndarray, quaternion: np.ndarray, waypoints: int, path: pathlib.Path
 ) -> dict[str, np.ndarray]:
-    """`waypoints` poses evenly spread along a path (n, 3), (n, 4)."""
+    """Resamples a path at points that divide its length evenly.
+
+    Args:
+      position: (n, 3) m.
+      quaternion: (n, 4), w first.
+      waypoints: number K of points.
+      path: the file, for errors.
+
+    Returns:
+      `position` (K, 3) and `quaternion` (K, 4).
+
+    Raises:
+      CongraspError: the wrist does not move, or a quaternion is zero.
+    """
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=-1))])
     moves = np.concatenate([[True], np.diff(along) > 1e-6])
     if moves.sum() < 2:

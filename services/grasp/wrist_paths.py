@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.arrays import check_arrays, read_npz
 from congrasp.services.grasp.bvh import read_bvh
-from congrasp.services.grasp.csv_paths import HUGE, UNIT_LENGTH, read_csv
+from congrasp.services.grasp.csv_paths import MAX_MAGNITUDE, NORM_TOLERANCE, read_csv
 
 MAX_CSV_BYTES = 32 << 20
 """Limit of the size of a CSV file."""
@@ -105,11 +105,11 @@ def _read_npz(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
         data = read_npz(path, remedy)
         prefix = "wrist_" if "wrist_position" in data else ""
         meanings = {f"{prefix}position": "(T, 3) m", f"{prefix}quaternion": "(T, 4) w x y z"}
-        check_arrays(data, meanings, indices=(), largest=HUGE)
+        check_arrays(data, meanings, indices=(), largest=MAX_MAGNITUDE)
     except (KeyError, ValueError) as error:
         raise CongraspError(f"{path} cannot be read: {error}.", remedy) from None
     position, quaternion = (data[name].astype(float) for name in meanings)
-    if np.abs(np.linalg.norm(quaternion, axis=-1) - 1).max() > UNIT_LENGTH:
+    if np.abs(np.linalg.norm(quaternion, axis=-1) - 1).max() > NORM_TOLERANCE:
         raise CongraspError(
             f"{path} has quaternions whose length is not one.",
             "Write unit quaternions (w, x, y, z).",

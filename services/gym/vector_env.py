@@ -16,7 +16,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.entry import compiling_entry, entry
-from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.resources import cores
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.metrics import episode_fields
 from congrasp.common.task.observation import layout

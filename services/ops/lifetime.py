@@ -270,8 +270,8 @@ class Child:
 
 
 def _memory_kills() -> int:
-    """See `common.runtime.parallel.memory_kills`, whose module a client's installation lacks."""
-    from congrasp.common.runtime.parallel import memory_kills
+    """See `common.runtime.resources.memory_kills`, whose module a client's installation lacks."""
+    from congrasp.common.runtime.resources import memory_kills
 
     return memory_kills()
 

@@ -15,7 +15,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.transport.keys import check_name
 from congrasp.common.wire.codec import Message, encode, finite
 from congrasp.common.wire.messages import EVENT, LONGEST_TEXT, METRICS, validate
-from congrasp.services.record.budget import LogBudget, Name
+from congrasp.services.record.budget import LogBudget, Publisher
 from congrasp.services.record.episode_entries import duration, raw_entry, scene_entries
 from congrasp.services.record.writer import (
     ROLLOUT_SCHEMA,
@@ -27,10 +27,11 @@ from congrasp.services.record.writer import (
     protobuf_channel,
 )
 
-_LONGEST_QUEUE_NS = 60_000_000_000
-"""Longest queue of an actor's episodes; later ones are dropped."""
-_LATEST_NS = 2**62
-"""Limit of times since 1970."""
+_MAX_WAIT_NS = 60_000_000_000
+"""Longest time, ns, that an episode waits for the end of the actor's previous ones; it is dropped
+if it had to wait longer."""
+_MAX_TIME_NS = 2**62
+"""Latest time of an event, ns since 1970."""
 _LEVELS = {
     "debug": Log.DEBUG,
     "info": Log.INFO,
@@ -41,10 +42,10 @@ _LEVELS = {
 
 
 class Converter:
-    """State across messages: fields of schemas, slots of actors, and the end of each actor's
-    episode.
+    """Converts messages one by one; its state grows with the publishers.
 
-    All of it is bounded, separately for every identity (`LogBudget`).
+    The state consists of the fields of schemas, the places of actors in the scene, and the end of
+    each actor's last episode. It is bounded separately for every identity (`LogBudget`).
     """
 
     def __init__(self) -> None:
@@ -52,8 +53,11 @@ class Converter:
         self._json = JsonChannels()
         self._budget = LogBudget(self._forget)
         self._slots: dict[str, int] = {}
+        """Place of each actor in the row of actors, by its name."""
         self._ends: dict[str, int] = {}
+        """End of each actor's last episode, ns since 1970, by its name."""
         self._now = 0
+        """Time of the last message, ns since 1970."""
         self._kinds: dict[str, Callable[[str, str, Message, int], Iterator[Entry]]] = {
             "metrics": self._metrics,
             "event": self._event,
@@ -79,8 +83,8 @@ class Converter:
             raise CongraspError(f"{ascii(kind)[:60]} is not a kind of log message.")
         check_name("role", role)
         check_name("role", name)
-        who = (role, name)
-        self._budget.admit(who)
+        publisher = Publisher(role, name)
+        self._budget.admit(publisher)
         convert = self._kinds[kind]
         try:
             message = Message(message.arrays, finite(message.meta))
@@ -89,12 +93,12 @@ class Converter:
             raise CongraspError(
                 f"It is not a valid {kind} message ({type(error).__name__})."
             ) from None
-        self._budget.charge(who, sum(len(entry.data) for entry in entries))
+        self._budget.charge(publisher, sum(len(entry.data) for entry in entries))
         return entries
 
-    def _forget(self, who: Name) -> None:
+    def _forget(self, publisher: Publisher) -> None:
         """Drops the state of a silent publisher."""
-        role, name = who
+        role, name = publisher
         self._json.forget(f"/metrics/{role}/{name}")
         self._json.forget(f"/version/{role}/{name}")
         self._json.forget(f"/episode/{name}/signals")
@@ -119,7 +123,7 @@ class Converter:
         level = _LEVELS.get(event.meta["level"].lower(), Log.UNKNOWN)
         log = Log(level=level, message=event.meta["text"], name=f"{role}/{name}")
         nanoseconds = round(1e9 * float(event.meta["time"]))
-        log.timestamp.FromNanoseconds(max(0, min(_LATEST_NS, nanoseconds)))
+        log.timestamp.FromNanoseconds(max(0, min(_MAX_TIME_NS, nanoseconds)))
         yield Entry(protobuf_channel(f"/events/{role}/{name}", Log), now, log.SerializeToString())
 
     def _rollout(self, role: str, name: str, message: Message, now: int) -> Iterator[Entry]:
@@ -131,7 +135,7 @@ class Converter:
         episode = Episode.from_message(message)
         # An episode that arrives while the previous one is playing waits for its end.
         start = max(now, self._ends.get(name, 0))
-        if start > now + _LONGEST_QUEUE_NS:
+        if start > now + _MAX_WAIT_NS:
             raise CongraspError(
                 f"The previous episodes are still playing for {(start - now) / 1e9:.0f} s."
             )

@@ -15,14 +15,14 @@ from congrasp.services.appearance.palette import MATERIAL_COLOURS, Colour
 
 _OVERLAP = 0.4
 """Weight of a link on a vertex from which the triangle belongs to the link."""
-_MOST_FACES = 12_000
-"""Triangles of a hand; meshes of links may have more."""
-_LEAST_FACES = 4
-"""Triangles of a part."""
+_MAX_FACES = 12_000
+"""Most triangles of a hand; the meshes of its links are simplified to them."""
+_MIN_FACES_OF_PART = 4
+"""Fewest triangles to which a part is simplified: those of a tetrahedron."""
 _GRID_M = 2.0**-14
 """Resolution of coordinates: few digits compress well."""
-_POINTS = 2048
-"""Points on a hand."""
+_POINTS_ON_HAND = 2048
+"""Number of points for viewers without meshes."""
 
 
 class Part(NamedTuple):
@@ -48,7 +48,7 @@ def surface_parts(hand: Hand) -> tuple[tuple[Part, ...], ...]:
     weights = skin.weights[skin.faces]
     strongest = np.eye(len(hand.links), dtype=bool)[weights.sum(1).argmax(-1)]
     members = strongest | (weights.max(1) >= _OVERLAP)
-    share = min(1.0, _MOST_FACES / len(skin.faces))
+    share = min(1.0, _MAX_FACES / len(skin.faces))
     material_of_face = skin.material[skin.faces[:, 0]]
     parts_of_links = []
     for is_member, origin in zip(members.T, skin.origins, strict=True):
@@ -72,16 +72,24 @@ def surface_points(hand: Hand) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
     for parts in parts_of_links:
         for part in parts:
             area += _mesh(part).area
-    return tuple(_sampled(parts, area) for parts in parts_of_links)
+    return tuple(_sample(parts, area) for parts in parts_of_links)
 
 
-def _sampled(parts: tuple[Part, ...], area: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) on parts of a hand with an area, m^2, and their colours (n, 3)."""
+def _sample(parts: tuple[Part, ...], area: float) -> tuple[np.ndarray, np.ndarray]:
+    """Samples points on the parts of a link, evenly by area.
+
+    Args:
+      parts: the parts.
+      area: area of all parts of the hand, m^2.
+
+    Returns:
+      Points (n, 3) in the link's frame, m, and their colours (n, 3).
+    """
     points = [np.zeros((0, 3))]
     colours = [np.zeros((0, 3))]
     for part in parts:
         mesh = _mesh(part)
-        count = round(_POINTS * mesh.area / area)
+        count = round(_POINTS_ON_HAND * mesh.area / area)
         points.append(trimesh.sample.sample_surface(mesh, count, seed=0)[0])
         colours.append(np.tile(part.colour, (count, 1)))
     return np.concatenate(points), np.concatenate(colours)
@@ -101,7 +109,7 @@ def _light(corners: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
     mesh = trimesh.Trimesh(corners.reshape(-1, 3), faces)
     if share < 1.0:
-        count = max(_LEAST_FACES, int(share * len(mesh.faces)))
+        count = max(_MIN_FACES_OF_PART, int(share * len(mesh.faces)))
         mesh = mesh.simplify_quadric_decimation(face_count=count)
     points, index = np.unique(np.round(mesh.vertices / _GRID_M), axis=0, return_inverse=True)
     light_faces = index.reshape(-1)[mesh.faces]

@@ -85,7 +85,7 @@ class Dropped:
         return max(FLUSH_SECONDS, lost)
 
     def __str__(self) -> str:
-        """One line; empty if the file is complete."""
+        """Describes the losses in one line; empty if the file is complete."""
         parts = []
         if self.places or self.messages:
             parts.append(self._damage())
@@ -109,7 +109,7 @@ class _Intact(NamedTuple):
 
     opcode: int
     content: Iterable[McapRecord]
-    """Its schemas, channels and messages."""
+    """Schemas, channels and messages in the record."""
     end: int
     """Offset of the next record."""
 
@@ -140,7 +140,7 @@ class _Channels:
         """Adds a channel, or replaces the one with its id."""
         self._channels[channel.id] = channel
 
-    def named(self, message: McapMessage) -> FileMessage | None:
+    def with_channel(self, message: McapMessage) -> FileMessage | None:
         """Returns a message with its channel and schema; None if its channel is unknown."""
         if message.channel_id not in self._channels and not self._is_summary_read:
             self._add_summary()
@@ -212,7 +212,7 @@ def _messages_of(record: _Intact, channels: _Channels, dropped: Dropped) -> Iter
             channels.add_channel(part)
         elif isinstance(part, McapMessage):
             dropped.last = max(dropped.last, part.log_time)
-            message = channels.named(part)
+            message = channels.with_channel(part)
             if message is None:
                 dropped.messages += 1
             else:

@@ -81,7 +81,7 @@ def read_records(
             raise CongraspError(
                 f"{path} is not an MCAP file.", "Pass a file written by 'congrasp record'."
             )
-        for schema, channel, message in _named(path, read_messages(file, dropped)):
+        for schema, channel, message in _with_file_in_errors(path, read_messages(file, dropped)):
             if not topic_filter(channel.topic):
                 continue
             yield Record(
@@ -96,8 +96,8 @@ def read_records(
         warn(f"{path} is {loss}.")
 
 
-def _named(path: pathlib.Path, messages: Iterator[_T]) -> Iterator[_T]:
-    """Yields the messages; errors name the file."""
+def _with_file_in_errors(path: pathlib.Path, messages: Iterator[_T]) -> Iterator[_T]:
+    """Yields the messages, and names the file in errors of the iterator."""
     try:
         yield from messages
     except CongraspError as error:

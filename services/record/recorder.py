@@ -24,8 +24,8 @@ _POLL_S = 0.1
 """Longest wait for a message before the thread looks whether to flush or to stop."""
 _CLOSING_SHARE = 0.8
 """Share of the time for closing in which received messages are written."""
-_LONGEST_REASON = 300
-"""Characters of an error in a warning."""
+_MAX_REASON_CHARACTERS = 300
+"""Most characters of an error that a warning quotes."""
 
 
 class Sink(Protocol):
@@ -143,7 +143,7 @@ class Recorder(Closing):
         except Exception as error:  # this thread continues after any message from a peer
             self.damaged += 1
             if self.damaged == 1:
-                reason = str(error)[:_LONGEST_REASON]
+                reason = str(error)[:_MAX_REASON_CHARACTERS]
                 text = f"a log message on {ascii(key)[:100]} was dropped: {reason}"
                 self._warn(str(CongraspError(text)))
             return

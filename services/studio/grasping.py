@@ -21,7 +21,7 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy.pretrained import hands_with_policy, policy_file
 from congrasp.common.request import GraspRequest
-from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.resources import cores
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import get_constraint, known, require_known
 from congrasp.common.task.constraints.priority import explain

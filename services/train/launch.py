@@ -18,7 +18,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_json
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
-from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.resources import cores
 from congrasp.common.transport import urls
 from congrasp.common.transport.keys import FLOWS
 from congrasp.common.transport.ports import (

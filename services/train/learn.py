@@ -18,7 +18,8 @@ from congrasp.common.config import MetricWriter, RunConfig
 from congrasp.common.hands import get_hand
 from congrasp.common.policy.bundle import policy_spec
 from congrasp.common.runtime.engines import PhysicsName
-from congrasp.common.runtime.parallel import cores, prepare_workers
+from congrasp.common.runtime.parallel import prepare_workers
+from congrasp.common.runtime.resources import cores
 from congrasp.common.transport import urls
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.memory import PairTransport

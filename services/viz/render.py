@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from congrasp.common.episode.episode import Episode
-from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.resources import cores
 from congrasp.services.viz.camera import Camera
 from congrasp.services.viz.episode_scene import episode_shapes
 from congrasp.services.viz.raster import render_scene

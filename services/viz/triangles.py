@@ -325,7 +325,7 @@ def cut(corners: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _cut_values(values: np.ndarray) -> np.ndarray:
-    """`cut` for values (F, 3, C) of corners, of which the first three are positions."""
+    """Cuts triangles as `cut` does; values (F, 3, C) of corners begin with their position."""
     first = values[:, 1, :3] - values[:, 0, :3]
     second = values[:, 2, :3] - values[:, 0, :3]
     area = np.linalg.norm(np.cross(first, second), axis=-1).sum() / 2

@@ -17,7 +17,7 @@ from congrasp.actors.rollout import finished_episodes
 from congrasp.actors.worker import RolloutWorker
 from congrasp.common.policy.bundle import InferenceParameters, mean_action
 from congrasp.common.policy.network import Layout
-from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.resources import cores
 from congrasp.common.task.types import Array
 from congrasp.services.evaluate.experiment import Experiment
 

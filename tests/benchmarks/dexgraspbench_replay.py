@@ -24,7 +24,7 @@ from congrasp.actors.stress import MAX_SHIFT_M, MAX_TURN_RAD, PUSH_FORCE_N
 from congrasp.common.hands.motors import motor_positions
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.files import write_atomically
-from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.resources import cores
 from congrasp.common.task.config import TaskConfig
 from tests.benchmarks.dexgraspbench_grasps import STATES, Grasp, State
 from tests.benchmarks.dexgraspbench_hands import benchmarked

@@ -20,7 +20,7 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import sample_action
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.runtime.engines import PhysicsName
-from congrasp.common.runtime.parallel import cores
+from congrasp.common.runtime.resources import cores
 from congrasp.common.task import plausibility
 from congrasp.common.task.sampling.build import build_bank
 from congrasp.services.evaluate.plan import protocol, required_hold_steps

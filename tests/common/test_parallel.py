@@ -1,4 +1,4 @@
-"""Cores and memory of this process, and work spread over processes, as scripts of users have it."""
+"""Work spread over processes, as scripts of users have it."""
 
 import operator
 import os
@@ -13,7 +13,8 @@ import pytest
 
 import congrasp
 from congrasp.common.runtime import parallel
-from congrasp.common.runtime.parallel import cores, memory, parallel_map
+from congrasp.common.runtime.parallel import parallel_map
+from congrasp.common.runtime.resources import cores
 from tests.children import python
 
 _ROOT = pathlib.Path(congrasp.__file__).parents[1]
@@ -92,6 +93,37 @@ def test_results_are_those_of_map(count, monkeypatch):
 def test_an_error_of_a_call_is_raised_as_by_map():
     with pytest.raises(ZeroDivisionError):
         parallel_map(operator.truediv, [1] * 80, [*range(1, 80), 0])
+
+
+@two_cores
+def test_workers_compute_with_one_thread():
+    script = """
+import os
+from congrasp.common.runtime.parallel import parallel_map
+print(set(parallel_map(os.getenv, ["OMP_NUM_THREADS"] * 64)))
+"""
+    done = python("-c", script, env={"OMP_NUM_THREADS": "4"})
+    assert done.stdout == "{'1'}\n", done.stderr
+
+
+@two_cores
+def test_helper_survives_a_request_that_it_cannot_run(tmp_path):
+    """A request from a folder that is gone runs in the caller, the next one in the same helper,
+    whose session the workers share.
+    """
+    script = """
+import os, sys
+from congrasp.common.runtime.parallel import parallel_map
+before = parallel_map(os.getsid, [0] * 64)
+current_folder = os.getcwd
+os.getcwd = lambda: sys.argv[1]
+in_caller = parallel_map(os.getsid, [0] * 64)
+os.getcwd = current_folder
+after = parallel_map(os.getsid, [0] * 64)
+print(set(in_caller) == {os.getsid(0)}, before == after, os.getsid(0) in before)
+"""
+    done = python("-c", script, tmp_path / "absent")
+    assert done.stdout == "True True False\n", done.stderr
 
 
 @two_cores
@@ -178,46 +210,3 @@ def test_interrupted_workers_print_nothing(tmp_path):
         assert error == ""
     finally:
         parent.kill()
-
-
-@pytest.mark.parametrize(
-    ("membership", "files", "expected"),
-    [
-        (
-            "0::/jobs/mine",
-            {"jobs/mine/cpu.max": ("50000 100000"), "jobs/mine/memory.max": "max"},
-            (1, None),
-        ),
-        (
-            "0::/jobs/mine",
-            {"jobs/mine/cpu.max": ("max 100000"), "jobs/cpu.max": "150000 100000"},
-            (2, None),
-        ),
-        # Less than this process uses
-        ("0::/", {"cpu.max": "800000 100000", "memory.max": f"{8 << 20}"}, (3, 0)),
-        (
-            "5:memory:/docker/1\n4:cpu,cpuacct:/docker/1",
-            {
-                "cpu/cpu.cfs_quota_us": "110000",
-                "cpu/cpu.cfs_period_us": "100000",
-                "memory/docker/1/memory.limit_in_bytes": f"{8 << 20}",
-            },
-            (2, 0),
-        ),
-        ("4:cpu:/", {"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"}, (3, None)),
-        ("", {}, (3, None)),
-    ],
-)
-def test_quotas_of_control_groups_count(membership, files, expected, monkeypatch, tmp_path):
-    """Those of the process's group and of all above it, in both versions, on a machine with three
-    cores.
-    """
-    monkeypatch.setattr(parallel.os, "sched_getaffinity", lambda pid: {0, 1, 2})
-    monkeypatch.setattr(parallel, "CGROUPS", tmp_path)
-    monkeypatch.setattr(parallel, "CGROUP_MEMBERSHIP", tmp_path / "membership")
-    (tmp_path / "membership").write_text(membership)
-    for name, text in files.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(f"{text}\n")
-    assert cores() == expected[0]
-    assert memory() == expected[1] if expected[1] is not None else memory() > 1 << 26

@@ -17,11 +17,14 @@ from congrasp.common import rotations as module
 from congrasp.common.ranges import task_faults
 from congrasp.common.task import observation
 from congrasp.common.task.config import SensingConfig, TaskConfig
+from congrasp.common.task.constraints import get_constraint
+from congrasp.common.task.constraints.specs import ObservationField
 from congrasp.common.task.features import scene_of
 from congrasp.common.task.readings import Readings, push, still
-from congrasp.common.task.sensors import get_sensor
+from congrasp.common.task.sensors import SENSORS, get_sensor
 from congrasp.common.task.sensors.base import EpisodeStart, Moment
 from congrasp.common.task.sensors.parameters import SensorParameters, draw_parameters, longest
+from congrasp.common.task.sensors.tracker import Tracker
 from congrasp.common.task.types import SceneState
 from tests.compiled import Compiled
 from tests.scenes import HAND, F, L, N, scene
@@ -389,3 +392,42 @@ def test_a_target_is_followed_within_the_history(latency, faults):
     """8 control steps of 10 ms: the oldest is 7 old."""
     task = TaskConfig(history=8, sensing=SensingConfig(latency=(0.0, latency)))
     assert len(list(task_faults(task))) == faults
+
+
+class _BlockBeforeState(Tracker):
+    """A tracker that lists its own block before its addition to the block `state`."""
+
+    def fields(self, hand, task):
+        return {
+            "switch": (ObservationField("switch", 1, "7"),),
+            "state": (ObservationField("light", 1, "5"),),
+        }
+
+    def observe(self, scene):
+        column = jnp.ones((len(scene.state.q), 1))
+        return {"switch": [7 * column], "state": [5 * column]}
+
+
+def test_blocks_of_a_sensor_may_have_any_order(monkeypatch):
+    monkeypatch.setitem(SENSORS, "tracked", _BlockBeforeState())
+    state, surface, goal = scene(0)
+    readings = readings_of(0, state)
+    row = observation.observe(scene_of(HAND, TASK, state, surface, goal, readings))[0]
+    sizes = dict(observation.layout(HAND, TASK))
+    assert list(sizes)[:2] == ["state", "switch"]
+    assert row.shape == (sum(sizes.values()),)
+    assert row[sizes["state"] - 1] == 5
+    assert row[sizes["state"]] == 7
+
+
+def test_block_of_privileged_fields_is_empty_for_a_robot(monkeypatch):
+    fingers = get_constraint("fingers")
+    (fields,) = fingers.fields(HAND, TASK)
+    privileged = tuple(field._replace(privileged=True) for field in fields)
+    monkeypatch.setattr(fingers, "fields", lambda hand, task: (privileged,))
+    state, surface, goal = scene(0)
+    readings = readings_of(0, state)
+    row = observation.observe(scene_of(HAND, TASK, state, surface, goal, readings))[0]
+    sizes = dict(observation.layout(HAND, TASK))
+    assert sizes["fingers"] == 0
+    assert row.shape == (sum(sizes.values()),)

@@ -4,7 +4,7 @@ pool of objects.
 
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
@@ -81,24 +81,34 @@ def with_columns(hand: Hand, task: TaskConfig, bank: ConstraintBank) -> Constrai
     return bank._replace(columns=by_constraint)
 
 
-def _build(
+def heading_arguments(
     hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int
-) -> ConstraintBank:
-    """Builds the bank of `build_bank` without the cache."""
+) -> list[Iterable[Any]]:
+    """Returns the arguments of `headings_of` for the objects of a pool, as columns for `map`.
+
+    The seed of an object's headings contains its index, so that the copies of an object in a pool
+    have different headings.
+    """
     count = len(objects)
-    rows = parallel_map(
-        headings_of,
+    return [
         itertools.repeat(task, count),
         objects,
         [(seed, n) for n in range(count)],
         itertools.repeat(None, count),
         itertools.repeat(object_scale(hand, task), count),
         itertools.repeat(outline(hand), count),
-    )
+    ]
+
+
+def _build(
+    hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], seed: int
+) -> ConstraintBank:
+    """Builds the bank of `build_bank` without the cache."""
+    rows = parallel_map(headings_of, *heading_arguments(hand, task, objects, seed))
     if not any(row["weight"] for row in rows):
         raise CongraspError(
-            f"None of {count} objects can be grasped: they lie too flat on the table in every "
-            f"resting pose.",
+            f"None of {len(objects)} objects can be grasped: they lie too flat on the table in "
+            f"every resting pose.",
             "Add other objects.",
         )
     # Closing a hand around objects takes seconds

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands.files import faults, hand_from_text, hand_text
+from congrasp.common.hands.files import hand_faults, hand_from_text, hand_text
 from congrasp.common.hands.meshes import MAX_DISTANCE_M, Meshes, load_meshes, save_meshes
 from congrasp.common.hands.motors import fitting_scale
 from congrasp.common.hands.spec import Hand, Link, wrist_gains
@@ -190,7 +190,7 @@ def _check_ranges(path: pathlib.Path, hand: Hand) -> None:
 
 def _check(path: pathlib.Path, hand: Hand, ignored: str = "") -> None:
     """Raises a CongraspError for an invalid hand; faults with the word `ignored` do not count."""
-    for fault in faults(hand):
+    for fault in hand_faults(hand):
         if ignored and ignored in fault:
             continue
         raise CongraspError(

@@ -3,7 +3,7 @@
 import numpy as np
 
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands.files import TAKEN_JOINTS
+from congrasp.common.hands.files import RESERVED_JOINTS
 from congrasp.common.hands.spec import Capsule, Joint, Link, vector
 from congrasp.common.io.inputs import distinct_names
 from congrasp.common.runtime.physics_library import mujoco
@@ -105,7 +105,7 @@ def _joint_names(tree: Tree, notes: list[str]) -> dict[int, str]:
     for link in tree.groups:
         joints += tree.joints(link)
     names = [identifier(tree.model.joint(j).name, f"joint_{j}") for j in joints]
-    taken = {*tree.names.values()} | TAKEN_JOINTS
+    taken = {*tree.names.values()} | RESERVED_JOINTS
     free_names = [f"{name}_joint" if name in taken else name for name in names]
     numbered = distinct_names(free_names, str)
     notes += renamed("joints", names, numbered)

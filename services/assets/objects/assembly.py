@@ -47,9 +47,9 @@ class _Files(NamedTuple):
     pieces: list[np.ndarray]
     """Vertices (V, 3) of the convex pieces in its folder."""
     visuals: list[trimesh.Trimesh]
-    """Its repaired surfaces."""
+    """Repaired surfaces of the object."""
     parts: list[trimesh.Trimesh]
-    """Those of its parts, unless they are the surfaces."""
+    """Surfaces of the object's parts; empty if `visuals` are the parts."""
     up: Literal["y", "z"]
     """The files' axis that was up."""
     coloured: list[pathlib.Path]
@@ -181,7 +181,7 @@ def _with_mass(weight: Weight, mass: float | None) -> Weight:
 
 
 def _read(source: Source, options: ImportOptions, notes: list[str]) -> _Files:
-    """The meshes of a source, repaired."""
+    """Reads and repairs the meshes of a source."""
     up = options.up
     piece_meshes = [read_mesh(file.path, up=up) for file in source.pieces]
     visuals = [read_mesh(file.path, notes, up) for file in source.visuals]
@@ -204,7 +204,7 @@ def _read(source: Source, options: ImportOptions, notes: list[str]) -> _Files:
     if not pieces and not source.parts:
         visuals = [_object_of_scan(mesh, options, notes) for mesh in visuals]
     if not source.parts:
-        visuals = [repair.closed(mesh, notes) for mesh in visuals]
+        visuals = [repair.close_and_orient(mesh, notes) for mesh in visuals]
     return _Files(pieces, visuals, parts, axis, coloured)
 
 

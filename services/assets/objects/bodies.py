@@ -14,18 +14,19 @@ _MAX_FLATNESS = 0.08
 _MIN_TABLE_RATIO = 2
 """Width of a table relative to that of the object on it."""
 _MIN_OBJECT_LENGTH_M = 0.03
-"""Least length of what is left of a scan without its table, m."""
-_MAX_BOX_GAP = 0.02
-"""Distance of the boxes of bodies that belong together, as a share of the mesh's size."""
+"""Shortest rest of a scan without its table; a shorter one is not an object."""
+_MAX_BOX_GAP_SHARE = 0.02
+"""Largest gap between the boxes of components of one body, as a share of the diagonal of the mesh's
+box."""
 
 
 class _Boxes(NamedTuple):
-    """Boxes around the components of a mesh."""
+    """Boxes around the C components of a mesh, in its unit."""
 
     low: np.ndarray
-    """(C, 3)."""
+    """(C, 3) smallest coordinates."""
     high: np.ndarray
-    """(C, 3)."""
+    """(C, 3) largest coordinates."""
 
     def diagonals(self) -> np.ndarray:
         """(C,) lengths."""
@@ -40,7 +41,7 @@ def largest_body(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
     labels = connected_component_labels(mesh.edges, len(mesh.vertices))
     if labels.max() == 0:
         return mesh
-    margin = _MAX_BOX_GAP / 2 * mesh.scale
+    margin = _MAX_BOX_GAP_SHARE / 2 * mesh.scale
     boxes = _boxes(np.asarray(mesh.vertices), labels)
     boxes = _Boxes(boxes.low - margin, boxes.high + margin)
     body = _join_touching(boxes)
@@ -135,7 +136,10 @@ def _boxes(vertices: np.ndarray, labels: np.ndarray) -> _Boxes:
 
 
 def _join_touching(boxes: _Boxes) -> np.ndarray:
-    """(C,) body of each component: those whose boxes touch are one, from the largest on."""
+    """(C,) body of each component; components whose boxes touch are one body.
+
+    The largest component is joined with its neighbours first, then the next one.
+    """
     low, high = boxes
     body = np.arange(len(low))
     for i in np.argsort(-boxes.diagonals()):

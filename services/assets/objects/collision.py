@@ -23,15 +23,16 @@ class Surfaces(NamedTuple):
     """The surfaces of an object."""
 
     meshes: Sequence[trimesh.Trimesh]
-    """One of the whole, or one of each part, m."""
+    """One mesh of the whole object, or one of each part, m."""
     shown: Sequence[trimesh.Trimesh]
     """The same without hollows that no finger enters."""
     triangles: np.ndarray
-    """(F, 3, 3) of all that are shown."""
+    """(F, 3, 3) triangles of `shown`, m."""
     volume: float | None
-    """Volume that they enclose (`interior.enclosed`), m^3; None if one is open."""
+    """Volume that the meshes enclose (`interior.enclosed`), m^3; None if one is open."""
     open_volume: float | None = None
-    """Volume that open ones enclose by winding numbers (`winding.open_volume`), m^3, if any."""
+    """Volume that open meshes enclose by winding numbers (`winding.open_volume`), m^3; None without
+    any."""
 
 
 class Collision(NamedTuple):

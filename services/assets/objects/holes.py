@@ -7,25 +7,25 @@ import trimesh
 def hole_loops(mesh: trimesh.Trimesh) -> list[np.ndarray]:
     """Returns the vertices around every hole, in the order of the triangles' edges.
 
-    There are none where a rim has an end.
+    Returns an empty list if the rim of a hole does not close, for then the mesh cannot be closed.
     """
     edges = np.asarray(mesh.edges)
     vertex_count = len(mesh.vertices)
     forward = edges[:, 0] * vertex_count + edges[:, 1]
     backward = edges[:, 1] * vertex_count + edges[:, 0]
-    following: dict[int, list[int]] = {}
+    next_vertices: dict[int, list[int]] = {}  # along edges of one triangle alone
     for start, end in edges[~np.isin(forward, backward)].tolist():
-        following.setdefault(start, []).append(end)
+        next_vertices.setdefault(start, []).append(end)
     loops = []
-    while following:
-        path = [next(iter(following))]
+    while next_vertices:
+        path = [next(iter(next_vertices))]
         while path:
-            ends = following.get(path[-1])
+            ends = next_vertices.get(path[-1])
             if not ends:
                 return []
             end = ends.pop()
             if not ends:
-                del following[path[-1]]
+                del next_vertices[path[-1]]
             if end in path:  # holes that meet in one vertex are separate holes
                 first = path.index(end)
                 loops.append(np.array(path[first:]))
@@ -65,7 +65,8 @@ def fill(mesh: trimesh.Trimesh, loops: list[np.ndarray]) -> trimesh.Trimesh:
 def _cover(
     vertices: np.ndarray, loop: np.ndarray, edges: set[tuple[int, ...]]
 ) -> np.ndarray | None:
-    """Triangles (N - 2, 3) that close a loop: each cuts off the corner with the shortest base.
+    """Closes a loop by triangles (N - 2, 3), each of which cuts off the corner with the shortest
+    base.
 
     Args:
       vertices: (V, 3) of the mesh.
@@ -73,7 +74,7 @@ def _cover(
       edges: edges in use, to which the bases are added.
 
     Returns:
-      The triangles; None if every base left would repeat an edge in use.
+      The triangles; None if every remaining base would repeat an edge in use.
     """
     rim = loop.tolist()
     faces: list[list[int]] = []

@@ -70,8 +70,8 @@ def read_mesh(
     check_triangles(path, mesh)
     vertices, faces = _finite(path, mesh, notes)
     _check_coordinates(path, vertices)
-    vertices, faces = repair.reduced(vertices, faces, notes)
-    mesh = repair.merged(upright(vertices, axis), faces, notes)
+    vertices, faces = repair.reduce_large(vertices, faces, notes)
+    mesh = repair.merge_vertices(upright(vertices, axis), faces, notes)
     if len(mesh.faces) < _MIN_TRIANGLES:
         raise CongraspError(
             f"{path} has no volume: it has {len(mesh.faces)} triangles with an area, and "
@@ -227,7 +227,9 @@ def _finite(
     Raises:
       CongraspError: too many are not finite.
     """
-    finite = repair.without_gaps(np.asarray(mesh.vertices), np.asarray(mesh.faces), notes)
+    finite = repair.without_invalid_vertices(
+        np.asarray(mesh.vertices), np.asarray(mesh.faces), notes
+    )
     if finite is None:
         count = int((~np.isfinite(mesh.vertices)).any(-1).sum())
         raise CongraspError(

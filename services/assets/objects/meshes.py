@@ -14,7 +14,7 @@ from congrasp.common.io.files import cache_folder
 from congrasp.common.io.inputs import read_file
 from congrasp.common.objects import store
 from congrasp.common.objects.spec import GraspObject
-from congrasp.common.runtime.parallel import cores, memory
+from congrasp.common.runtime.resources import cores, memory
 from congrasp.services.assets.objects.assembly import assemble
 from congrasp.services.assets.objects.decompose import (
     MAX_PROCESSOR_S,

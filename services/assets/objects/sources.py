@@ -67,7 +67,18 @@ def find_sources(path: str | os.PathLike[str]) -> list[Source]:
       meshes are its surface: `<name>.stl` all of it, `<name>_<part>.stl` its parts.
     * A folder with `<name>.*` and at least two `<name>_<part>.*` is one object with labelled parts.
     * In any other folder every mesh is an object; without meshes, the objects are those of its
-      subfolders. Names that repeat have numbers.
+      subfolders.
+
+    An object has the name of its file or folder. Names that repeat get numbers.
+
+    Raises:
+      CongraspError: there is nothing to import.
+    """
+    return with_distinct_names(find_unnumbered_sources(path))
+
+
+def find_unnumbered_sources(path: str | os.PathLike[str]) -> list[Source]:
+    """Finds the objects at a path as `find_sources` does, without numbers in names that repeat.
 
     Raises:
       CongraspError: there is nothing to import.
@@ -79,18 +90,18 @@ def find_sources(path: str | os.PathLike[str]) -> list[Source]:
         raise CongraspError(f"There is no file or folder {path}.", "Check the path.")
     meshes = _meshes_in(path)
     if meshes:
-        return distinct(_in_folder(path, meshes))
+        return _in_folder(path, meshes)
     sources: list[Source] = []
     for folder in sorted(path.iterdir()):
         if folder.is_dir():
             sources += _in_subfolder(folder)
     if not sources:
         raise _nothing_found(path)
-    return distinct(sources)
+    return sources
 
 
-def distinct(sources: Sequence[Source]) -> list[Source]:
-    """Returns the sources with distinct names."""
+def with_distinct_names(sources: Sequence[Source]) -> list[Source]:
+    """Returns the sources with distinct names: repeated ones get numbers, such as mug-2."""
     names = distinct_names(source.name for source in sources)
     return [
         dataclasses.replace(source, name=name) for source, name in zip(sources, names, strict=True)

@@ -32,21 +32,22 @@ class WindingNumbers(NamedTuple):
     """Winding numbers at the points of a lattice."""
 
     number: np.ndarray
-    """(X, Y, Z)."""
+    """(X, Y, Z) winding numbers."""
     low: np.ndarray
     """(3,) first point, m."""
     spacing: float
-    """m."""
+    """Distance of neighbouring points along an axis, m."""
 
 
 class _Direction(NamedTuple):
     """A direction on the lattice, and its opposite."""
 
     axis: int
-    """Its last axis of a coordinate that is not zero, along which it is one."""
+    """Last axis along which the direction has a coordinate other than zero; there it is 1."""
     steps: tuple[int, int]
-    """Its coordinates along the two following axes, in cyclic order."""
+    """Coordinates (-1, 0 or 1) along the two axes that follow `axis` in cyclic order."""
     weight: float
+    """Weight of the direction in the mean."""
 
 
 def open_volume(triangles: np.ndarray) -> float | None:
@@ -92,7 +93,7 @@ def winding_numbers(triangles: np.ndarray, count: int = _LATTICE_POINTS) -> Wind
 
 
 def _directions() -> Iterator[_Direction]:
-    """Yields one of each of the 13 pairs of opposite directions."""
+    """Yields one direction of each of the 13 opposite pairs."""
     for axis, free in enumerate([(0, 0), (0, 1), (1, 1)]):
         after, before = free
         for first in range(-after, after + 1):

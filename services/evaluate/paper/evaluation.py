@@ -24,7 +24,7 @@ from congrasp.services.evaluate.pages import count_causes
 from congrasp.services.evaluate.paper.parts import Part
 from congrasp.services.evaluate.pictures import failure_sheets
 from congrasp.services.evaluate.plan import NOMINAL_FRICTION
-from congrasp.services.evaluate.pools import Pools, procedural_pools
+from congrasp.services.evaluate.pools import PoolLoaders, procedural_pools
 from congrasp.services.evaluate.scores import Row, write_json
 from congrasp.services.evaluate.tables import Evaluation, evaluate_tables
 from congrasp.services.viz.sheets import save_png
@@ -160,7 +160,7 @@ def _tables(part: Part, data: CapturedObjects | None) -> tuple[str, ...]:
     return _TABLES_OF_CAPTURED[data.paper]
 
 
-def _pools(part: Part, settings: PartSettings) -> Pools | None:
+def _pools(part: Part, settings: PartSettings) -> PoolLoaders | None:
     """Returns the pools of the table of many objects; None for other tables."""
     if part.table != "objects":
         return None

@@ -6,7 +6,7 @@ import trimesh
 
 from congrasp.common.objects.spec import Colours
 from congrasp.services.appearance import surface_colours
-from congrasp.services.appearance.subdivision import subdivide
+from congrasp.services.appearance.subdivision import bisect_longest, subdivide
 from congrasp.services.appearance.surface_colours import colours_at, paint_surface
 
 
@@ -35,6 +35,14 @@ def test_a_mesh_of_many_faces_is_left_as_it_is():
     vertices, faces = subdivide(mesh.vertices, mesh.faces, 0.001, 1_000)
     np.testing.assert_array_equal(faces, mesh.faces)
     np.testing.assert_allclose(vertices, mesh.vertices, atol=1e-6)
+
+
+def test_more_triangles_than_the_limit_are_unchanged():
+    mesh = trimesh.creation.icosphere(2)
+    corners = mesh.vertices[mesh.faces]
+    bisected = bisect_longest(corners, 0.01, max_triangles=100)
+    assert len(bisected) == len(corners)
+    assert sorted(bisected.tolist()) == sorted(corners.tolist())
 
 
 RED = (255, 0, 0)

@@ -21,7 +21,12 @@ from congrasp.services.evaluate.episodes import Sample
 from congrasp.services.evaluate.exams import FAMILIES
 from congrasp.services.evaluate.experiment import Experiment
 from congrasp.services.evaluate.many_objects import evaluate_pools
-from congrasp.services.evaluate.pools import Loaded, Pools, folder_pools, procedural_pools
+from congrasp.services.evaluate.pools import (
+    LoadedObjects,
+    PoolLoaders,
+    folder_pools,
+    procedural_pools,
+)
 from tests.task import TASK, policy
 
 OBJECTS = procedural.generate_many(5, 1_000_000)
@@ -85,10 +90,10 @@ def evaluated(
 def pools_of(*groups, left_out=()):
     """Pools of these objects; `left_out` belongs to the first."""
     makes = [
-        lambda i=i, group=group: Loaded(group, [] if i else list(left_out))
+        lambda i=i, group=group: LoadedObjects(group, [] if i else list(left_out))
         for i, group in enumerate(groups)
     ]
-    return Pools("test", max(map(len, groups)), makes)
+    return PoolLoaders("test", max(map(len, groups)), makes)
 
 
 def test_episodes_of_an_object_do_not_depend_on_its_pool(simulated):
@@ -131,9 +136,9 @@ def test_a_stopped_evaluation_resumes_at_the_next_pool(simulated, tmp_path):
 
     first = pools_of(OBJECTS[:2], OBJECTS[2:4])
     with pytest.raises(KeyboardInterrupt):
-        evaluated(first._replace(make=[first.make[0], stop]), 8, tmp_path)
+        evaluated(first._replace(loaders=[first.loaders[0], stop]), 8, tmp_path)
     assert len(simulated) == 1
-    again = first._replace(make=[stop, first.make[1]])  # the first is not even made
+    again = first._replace(loaders=[stop, first.loaders[1]])  # the first is not even made
     rows = evaluated(again, 8, tmp_path)
     assert [row.to_json() for row in rows] == [row.to_json() for row in complete]
     assert [names for names, _ in simulated] == [
@@ -155,9 +160,9 @@ def test_no_more_than_the_next_pool_is_made_ahead(simulated):
 
     def make(i):
         loaded.append(i)
-        return Loaded(OBJECTS[:1], [])
+        return LoadedObjects(OBJECTS[:1], [])
 
-    pools = Pools("test", 1, [lambda i=i: make(i) for i in range(5)])
+    pools = PoolLoaders("test", 1, [lambda i=i: make(i) for i in range(5)])
     evaluated(
         pools, 5, track=lambda label, total: lambda done: ahead.append(len(loaded) - len(simulated))
     )
@@ -192,8 +197,66 @@ def test_objects_that_the_hand_cannot_approach_are_left_out_and_counted(
         evaluated(pools_of(OBJECTS[1:2]), 6)
 
 
+def _stub_headings(monkeypatch, weight_of):
+    """Headings of objects are `weight_of(obj, index)`, None for an object without any."""
+
+    def headings_of(task, obj, seed, given, scale, own):
+        weight = weight_of(obj, seed[1])
+        if weight is None:
+            raise CongraspError(f"The object '{obj.name}' cannot be approached.")
+        return {"weight": np.float32(weight)}
+
+    def build_bank(hand, task, objects, seed):
+        weights = [
+            headings_of(task, obj, (seed, i), None, 1.0, None)["weight"]
+            for i, obj in enumerate(objects)
+        ]
+        if not any(weights):
+            raise CongraspError("They lie too flat.")
+        return [obj.name for obj in objects]
+
+    monkeypatch.setattr(experiment, "build_bank", build_bank)
+    monkeypatch.setattr(of_objects, "headings_of", headings_of)
+
+
+def _prepared(objects, pool_size):
+    """The only pool, of these objects."""
+    unmeasured = dataclasses.replace(experiment_without_objects(), measured=False)
+    pools = pools_of(objects)._replace(pool_size=pool_size)
+    with of_objects.prepare_pools(unmeasured, pools, [0]) as prepared:
+        return next(prepared)
+
+
+def test_object_with_an_unreachable_copy_is_left_out(simulated, monkeypatch):
+    """The copy pads a pool, and has other random headings."""
+
+    def weight_of(obj, index):
+        return None if obj.name == OBJECTS[0].name and index == 4 else 1.0
+
+    _stub_headings(monkeypatch, weight_of)
+    pool = _prepared(OBJECTS[:4], pool_size=5)
+    assert pool.left_out == [OBJECTS[0].name]
+    assert pool.real_count == 3
+    names = [obj.name for obj in pool.experiment.objects]
+    assert names == [OBJECTS[i].name for i in (1, 2, 3, 1, 2)]
+
+
+@pytest.mark.parametrize("neighbour", [1.0, None])
+def test_flat_objects_remain_whatever_their_neighbours(neighbour, simulated, monkeypatch):
+    weights = {OBJECTS[0].name: 0.0, OBJECTS[1].name: neighbour}
+    _stub_headings(monkeypatch, lambda obj, index: weights.get(obj.name, 1.0))
+    assert OBJECTS[0].name not in _prepared(OBJECTS[:3], pool_size=3).left_out
+
+
+def test_pool_of_flat_objects_is_empty(simulated, monkeypatch):
+    _stub_headings(monkeypatch, lambda obj, index: 0.0)
+    pool = _prepared(OBJECTS[:2], pool_size=3)
+    assert pool.real_count == 0
+    assert pool.left_out == [obj.name for obj in OBJECTS[:2]]
+
+
 def test_a_folder_is_divided_evenly_and_read_pool_by_pool(tmp_path, monkeypatch):
-    monkeypatch.setattr(of_objects, "MAX_OBJECTS_OF_FOLDER", 2)
+    monkeypatch.setattr(of_objects, "MAX_OBJECTS_WITH_MESHES", 2)
     for obj in OBJECTS:
         Catalogue(tmp_path).add(obj)
     pools = folder_pools(tmp_path, "native")
@@ -201,17 +264,17 @@ def test_a_folder_is_divided_evenly_and_read_pool_by_pool(tmp_path, monkeypatch)
     assert folder_pools(tmp_path, "native").source != pools.source, (
         "results of other files are not resumed"
     )
-    loaded = [make() for make in pools.make]
-    assert pools.size == 2
+    loaded = [make() for make in pools.loaders]
+    assert pools.pool_size == 2
     assert [len(one.objects) for one in loaded] == [2, 2, 0]
     assert [one.left_out for one in loaded] == [[], [], [sorted(obj.name for obj in OBJECTS)[-1]]]
 
 
 def test_procedural_pools_hold_different_objects_in_equal_numbers(monkeypatch):
-    monkeypatch.setattr(of_objects, "MAX_OBJECTS_ELSEWHERE", 2)
+    monkeypatch.setattr(of_objects, "MAX_OBJECTS_OFF_DEVICE", 2)
     pools = procedural_pools(5, "native", "development")
-    objects = [make().objects for make in pools.make]
-    assert pools.size == 2
+    objects = [make().objects for make in pools.loaders]
+    assert pools.pool_size == 2
     assert [len(pool) for pool in objects] == [2, 2, 2]
     names = [obj.name for obj in itertools.chain(*objects)]
     assert names == [obj.name for obj in procedural.generate_many(6, 1_000_000, FAMILIES)]

@@ -124,6 +124,7 @@ def _ros(pose, first):
         (ROS, "pq", " "),
         ("# a title\n" + ROS, "pq", ","),
         ("# ground truth trajectory\n# timestamp tx ty tz qx qy qz qw", "tpq", " "),
+        ("#\tx\ty\tz\tqx\tqy\tqz\tqw", "pq", "\t"),
         (EUROC, "tpwv", ","),
         (EUROC.replace("timestamp", "timestamp [ns]"), "tpwv", ","),
         (_ros("field.pose", "%time"), "tpq", ","),
@@ -166,6 +167,9 @@ def test_cells_may_be_empty_or_text_and_have_decimal_commas(tmp_path):
     save("note.csv", f"note,{ROS}", [[f"a;b #{i}", *row] for i, row in enumerate(rows)])
     plain = np.c_[POSITION, ROTATION.as_quat(scalar_first=True)].tolist()
     save("end.csv", "# three words here", [[*r[:6], f"{r[6]} # a"] for r in plain])
+    save("seven.csv", "# path of the right wrist in metres", plain)
+    save("date.csv", "# recorded by Anna on the 12 May", plain, " ")
+    save("units.csv", "# the length units are metres", plain)
     with pytest.raises(CongraspError, match="quaternions whose length is not one"):
         save("turned.csv", "# rotation first", [row[3:] + row[:3] for row in rows])
 
@@ -211,10 +215,14 @@ def test_ambiguous_header_is_refused(tmp_path, header, complaint):
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("0,0,0,nan,nan,nan,nan\n0,0,0,1,0,0,0", "line 1 of .* is not 7 finite numbers"),
-        ("1,2,3,,x,y,z\n0,0,0,1,0,0,0", "line 1 of .* is not 7 finite numbers"),
-        ("0.1 0 0 0 1 0 0 0", "line 1 of .* is not 7 finite numbers"),
-        (f"{ROS}\nm,m,m,,,,\n0,0,0,0,0,0,1", "line 2 of .* is not 7 finite numbers"),
+        (
+            "0,0,0,nan,nan,nan,nan\n0,0,0,1,0,0,0",
+            "line 1 of .* has 'nan' in column 4, which is not a finite",
+        ),
+        ("0,1e10,0,1,0,0,0", "line 1 of .* has '1e10' in column 2"),
+        ("1,2,3,,x,y,z\n0,0,0,1,0,0,0", "line 1 of .* has '' in column 4"),
+        ("0.1 0 0 0 1 0 0 0", "line 1 of .* has 8 cells instead of 7"),
+        (f"{ROS}\nm,m,m,,,,\n0,0,0,0,0,0,1", "line 2 of .* has 'm' in column 1"),
         (f"note,{ROS}\n{'a' * 200_000},0,0,0,0,0,0,1", "line 2 of .* cannot be read: field larger"),
         (
             "Format Version,1.23,Length Units,Millimeters\nX,Y,Z,W,X,Y,Z\n0,0,0,1,0,0,0",

@@ -16,7 +16,7 @@ from congrasp.common.hands import get_hand
 from congrasp.common.hands.files import hand_text
 from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message
-from congrasp.services.record.budget import LogBudget
+from congrasp.services.record.budget import LogBudget, Publisher
 from congrasp.services.record.converter import Converter
 from congrasp.services.record.live import LiveServer
 from tests.episodes import episode_message
@@ -81,29 +81,58 @@ def test_names_of_one_identity_are_limited_until_they_have_been_silent():
     forgotten = []
     budget = LogBudget(forgotten.append, clock)
     for i in range(64):
-        budget.admit(("actor", f"1.{i}"))
+        budget.admit(Publisher("actor", f"1.{i}"))
     with pytest.raises(CongraspError, match="More than 64 names of one certificate"):
-        budget.admit(("actor", "1.new"))
-    budget.admit(("actor", "0.a"))
-    budget.admit(("learner", "0"))
+        budget.admit(Publisher("actor", "1.new"))
+    budget.admit(Publisher("actor", "0.a"))
+    budget.admit(Publisher("learner", "0"))
     clock.now = 50.0
-    budget.admit(("actor", "1.0"))
+    budget.admit(Publisher("actor", "1.0"))
     clock.now = 61.0
-    budget.admit(("actor", "1.new"))
-    assert forgotten == [("actor", "1.1")]
+    budget.admit(Publisher("actor", "1.new"))
+    assert forgotten == [Publisher("actor", "1.1")]
 
 
 def test_bytes_are_limited_by_identity():
     clock = Clock()
-    budget = LogBudget(lambda who: None, clock)
+    budget = LogBudget(lambda publisher: None, clock)
     for name in ("1.a", "1.b"):
-        budget.admit(("actor", name))
-        budget.charge(("actor", name), 130 << 20)
+        budget.admit(Publisher("actor", name))
+        budget.charge(Publisher("actor", name), 130 << 20)
     with pytest.raises(CongraspError, match="more than 16 MiB of logs a second"):
-        budget.admit(("actor", "1.c"))
-    budget.admit(("actor", "0.a"))
+        budget.admit(Publisher("actor", "1.c"))
+    budget.admit(Publisher("actor", "0.a"))
     clock.now = 1.0  # 16 of the 4 MiB that are owed
-    budget.admit(("actor", "1.c"))
+    budget.admit(Publisher("actor", "1.c"))
+
+
+def test_a_message_beyond_the_bytes_replaces_no_name():
+    clock = Clock()
+    forgotten = []
+    budget = LogBudget(forgotten.append, clock)
+    for i in range(64):
+        budget.admit(Publisher("actor", f"1.{i}"))
+    clock.now = 61.0
+    budget.charge(Publisher("actor", "1.0"), 300 << 20)
+    with pytest.raises(CongraspError, match="MiB"):
+        budget.admit(Publisher("actor", "1.new"))
+    assert forgotten == []
+
+
+def test_silent_identities_are_replaced():
+    clock = Clock()
+    forgotten = []
+    budget = LogBudget(forgotten.append, clock)
+    for i in range(1024):
+        budget.admit(Publisher("actor", f"{i}.a"))
+    budget.charge(Publisher("actor", "1.a"), 1500 << 20)
+    with pytest.raises(CongraspError, match="1024"):
+        budget.admit(Publisher("actor", "new.a"))
+    clock.now = 61.0
+    budget.admit(Publisher("actor", "new.a"))
+    assert forgotten == [Publisher("actor", "0.a")]
+    with pytest.raises(CongraspError, match="1024"):  # the next one still owes bytes
+        budget.admit(Publisher("actor", "newer.a"))
 
 
 def _odd(tmp_path):

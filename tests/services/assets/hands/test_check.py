@@ -12,7 +12,7 @@ import pytest
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.files import faults, hand_text
+from congrasp.common.hands.files import hand_faults, hand_text
 from congrasp.common.hands.spec import Coupling
 from congrasp.services.assets.hands import check, geometry_checks, physics_checks, trials
 from congrasp.services.assets.hands.check import check_hand
@@ -49,7 +49,7 @@ def with_joints(hand, change, only=""):
 @functools.cache
 def verdicts(hand):
     """The first finding of each check by its name, and all that was found."""
-    assert not faults(hand)
+    assert not hand_faults(hand)
     report = check_hand(hand, recipe(hand).task, 2)
     lines = {}
     for finding in report.findings:

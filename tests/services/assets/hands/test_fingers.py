@@ -5,7 +5,7 @@ import pathlib
 
 import pytest
 
-from congrasp.common.hands.files import faults, hand_from_text, hand_text
+from congrasp.common.hands.files import hand_faults, hand_from_text, hand_text
 from congrasp.common.hands.spec import Hand
 from congrasp.services.assets.hands.finger_checks import finger_findings
 from congrasp.services.assets.hands.model_files import Proposal, propose
@@ -71,11 +71,11 @@ def test_fingers_on_a_carrying_link_are_all_imported(carried):
 
 
 def test_fingers_on_a_carrying_link_close(carried):
-    assert not faults(carried)
+    assert not hand_faults(carried)
     for name in ("ring", "little"):
         assert carried.closed_pose[f"{name}_bend"] > carried.open_pose.get(f"{name}_bend", 0.0)
     assert [finding.verdict for finding in finger_findings(carried)] == ["passed"]
-    assert faults(hand_from_text(hand_text(carried))) == []
+    assert hand_faults(hand_from_text(hand_text(carried))) == []
 
 
 def test_finger_branch_that_is_short_is_no_finger(tmp_path):
@@ -104,7 +104,7 @@ def test_check_of_a_lost_finger_fails(carried):
         for link in carried.links
     )
     hand = dataclasses.replace(carried, links=links)
-    assert not faults(hand)
+    assert not hand_faults(hand)
     failed = {f.measured.split("'")[1]: f.check for f in finger_findings(hand)}
     assert failed == {"little_end": "finger", "little_root": "motor", "little_bend": "motor"}
     assert {f.verdict for f in finger_findings(hand)} == {"failed"}
@@ -134,6 +134,6 @@ def test_two_tips_on_one_finger_are_a_fault(carried):
         dataclasses.replace(link, tip=(0.0, 0.0, 0.1)) if link.name == "ring" else link
         for link in carried.links
     )
-    (fault,) = faults(dataclasses.replace(carried, links=links))
+    (fault,) = hand_faults(dataclasses.replace(carried, links=links))
     assert "'ring'" in fault
     assert "'ring_end'" in fault

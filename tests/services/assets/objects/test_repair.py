@@ -15,7 +15,7 @@ from congrasp.services.assets.objects.hollows import without_hollows
 from congrasp.services.assets.objects.mesh_files import load_geometry, read_mesh
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.assets.objects.repair import closed, reduced
+from congrasp.services.assets.objects.repair import close_and_orient, reduce_large
 
 RADIUS = 0.03
 
@@ -28,7 +28,7 @@ def test_an_opening_is_left_and_bodies_that_touch_stay_together():
     half = ball()
     notes = list[str]()
     half.update_faces(half.triangles_center[:, 2] < 0)
-    assert len(closed(half, notes).faces) == len(half.faces)
+    assert len(close_and_orient(half, notes).faces) == len(half.faces)
     assert not notes  # a bowl stays a bowl
     pair = trimesh.util.concatenate([ball(), ball().apply_translation([2 * RADIUS, 0, 0])])
     assert len(largest_body(pair, notes).faces) == 2 * len(ball().faces)
@@ -76,7 +76,9 @@ def test_a_distant_speck_changes_nothing_of_a_large_scan(tmp_path):
     body = largest_body(read_mesh(tmp_path / "a.stl"), [])
     assert body.is_watertight
     assert body.volume == pytest.approx(volume, rel=0.01)
-    small = trimesh.Trimesh(*reduced(np.vstack([scan.vertices, [100.0, 0, 0]]), scan.faces, []))
+    small = trimesh.Trimesh(
+        *reduce_large(np.vstack([scan.vertices, [100.0, 0, 0]]), scan.faces, [])
+    )
     assert small.volume == pytest.approx(volume, rel=0.01)
 
 
@@ -102,7 +104,51 @@ def test_a_handle_of_one_sheet_is_kept(rows):
     assert mug.faces.shape == (len(cup.faces) + len(faces), 3)
     assert mug.body_count == 1
     notes = list[str]()
-    assert len(closed(mug, notes).faces) == len(mug.faces)
+    assert len(close_and_orient(mug, notes).faces) == len(mug.faces)
+    assert not notes
+
+
+def _body_with_fin(rings):
+    """A cube with a sheet over its top, along one of whose edges it is attached; edges of the sheet
+    are `rings` triangles from its middle.
+    """
+    cube = trimesh.creation.box((1.0, 1.0, 1.0))
+    for _ in range(4):
+        cube = cube.subdivide()
+    points = []
+    for i, j in itertools.product(range(rings + 1), repeat=2):
+        gap = 0.005 if j else 0.0
+        points.append([i / 16 - 0.5, j / 64 - 0.5, 0.5 + gap])
+    triangles = []
+    for i, j in itertools.product(range(rings), repeat=2):
+        corner = i * (rings + 1) + j
+        across = corner + rings + 2
+        triangles.append([corner, corner + 1, across])
+        triangles.append([corner, across, across - 1])
+    mesh = trimesh.util.concatenate([cube, trimesh.Trimesh(points, triangles, process=False)])
+    mesh.merge_vertices()
+    return mesh
+
+
+@pytest.mark.parametrize(("rings", "removed"), [(9, 162), (10, 200), (11, 0)])
+def test_fins_have_up_to_ten_rings(rings, removed):
+    mesh = _body_with_fin(rings)
+    notes = list[str]()
+    assert len(close_and_orient(mesh, notes).faces) == len(mesh.faces) - removed
+    assert len(notes) == bool(removed)
+
+
+def test_unmerged_bodies_have_no_note_on_repeats():
+    """Two cubes touch along a face, whose triangles repeat, and a third one along an edge."""
+    cube = trimesh.creation.box((1.0, 1.0, 1.0))
+    mirrored = trimesh.Trimesh(
+        cube.vertices * [-1, 1, 1] + [1, 0, 0], cube.faces[:, ::-1], process=False
+    )
+    at_edge = cube.copy().apply_translation([0, 1, 1])
+    bodies = trimesh.util.concatenate([cube, mirrored, at_edge])
+    notes = list[str]()
+    mesh = repair.merge_vertices(np.asarray(bodies.vertices), np.asarray(bodies.faces), notes)
+    assert len(mesh.faces) == len(bodies.faces)
     assert not notes
 
 
@@ -330,8 +376,8 @@ def test_a_hollow_without_an_opening_is_filled():
 
 @pytest.mark.slow
 def test_millions_of_triangles(tmp_path, quick_import, monkeypatch):
-    monkeypatch.setattr(repair, "MAX_UNMERGED_FACES", 20_000)
-    monkeypatch.setattr(repair, "MAX_FACES", 2_000)
+    monkeypatch.setattr(repair, "MAX_FACES_AT_READING", 20_000)
+    monkeypatch.setattr(repair, "MAX_SIMPLE_FACES", 2_000)
     fine = trimesh.creation.icosphere(subdivisions=6, radius=RADIUS)
     fine.export(tmp_path / "fine.stl")
     obj = one_object(tmp_path / "fine.stl", ImportOptions(cache_dir=str(tmp_path / "cache")))
@@ -342,14 +388,14 @@ def test_millions_of_triangles(tmp_path, quick_import, monkeypatch):
     np.testing.assert_allclose(np.linalg.norm(obj.points, axis=-1), RADIUS, rtol=0.02)
     # As STL files have it: no triangle shares a corner
     soup = fine.vertices[fine.faces].reshape(-1, 3)
-    vertices, faces = reduced(soup, np.arange(len(soup)).reshape(-1, 3), [])
+    vertices, faces = reduce_large(soup, np.arange(len(soup)).reshape(-1, 3), [])
     assert trimesh.Trimesh(vertices, faces).is_watertight
 
 
 def test_a_surface_without_an_outside_is_unchanged():
     strip = trimesh.Trimesh(*_moebius())
     notes: list[str] = []
-    assert closed(strip, notes).faces.shape == strip.faces.shape
+    assert close_and_orient(strip, notes).faces.shape == strip.faces.shape
     assert not notes
 
 
