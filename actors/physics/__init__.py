@@ -55,11 +55,16 @@ def _make_native(*arguments: Any) -> "Physics":
     return NativePhysics(*arguments)
 
 
-def _make_physx(*arguments: Any) -> "Physics":
-    """Builds PhysX on threads."""
+def _make_physx(
+    hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], threads: int
+) -> "Physics":
+    """Builds PhysX in as many processes as there may be threads."""
     from congrasp.actors.physics.physx.batch import PhysxPhysics
+    from congrasp.actors.physics.physx.processes import PhysxProcesses
 
-    return PhysxPhysics(*arguments)
+    if threads <= 1:
+        return PhysxPhysics(hand, task, objects)
+    return PhysxProcesses(hand, task, objects, threads)
 
 
 def _missing_physx(backend: str) -> CongraspError | None:

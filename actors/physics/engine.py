@@ -1,7 +1,8 @@
 """Interface of physics engines: a batch of environments with one hand and one object each.
 
 `warp` and `jax` are pure functions over pytrees that are traced into a compiled rollout; `native`
-steps MuJoCo C on threads and mutates its state. Both use the same three calls.
+steps MuJoCo C on threads and `physx` PhysX in processes, and they mutate their state. All use the
+same three calls.
 """
 
 import types
@@ -10,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from congrasp.actors.physics.scene import SENSOR_WIDTH, Addresses
 from congrasp.common.objects.spec import GraspObject
@@ -109,6 +111,11 @@ class Physics(Protocol):
 
     def close(self) -> None:
         """Releases threads and memory; may be called twice."""
+
+
+def host_arrays(reset_state: ResetState) -> ResetState:
+    """Reset states as NumPy arrays, for an engine that steps on the CPU."""
+    return ResetState(*(np.asarray(leaf) for leaf in reset_state))
 
 
 def where_environments(mask: Array, new: Any, old: Any) -> Any:

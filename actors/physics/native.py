@@ -11,8 +11,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from congrasp.actors.physics.engine import PhysicsState, ResetState, has_diverged, physics_state
-from congrasp.actors.physics.scene import GAINS, MASS_POWERS, TABLE_AWAY, addresses, compile_scene
+from congrasp.actors.physics.compiled_objects import CompiledObjects
+from congrasp.actors.physics.engine import (
+    PhysicsState,
+    ResetState,
+    has_diverged,
+    host_arrays,
+    physics_state,
+)
+from congrasp.actors.physics.scene import GAINS, MASS_POWERS, TABLE_AWAY, addresses
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
@@ -80,17 +87,15 @@ class NativePhysics:
           objects: the pool indexed by `ResetState.object_index`.
           threads: threads that step environments in parallel.
         """
-        self._hand = hand
         self._task = task
-        self._objects = objects
         self.threads = max(1, threads)
         self._pool = concurrent.futures.ThreadPoolExecutor(
             self.threads, thread_name_prefix="physics"
         )
-        self._compiled: dict[int, Scene] = {}
+        self._compiled = CompiledObjects(hand, task, objects, Scene)
         self.scenes: list[Scene] = []  # scene of each environment
         self.instances: list[EnvInstance] = []
-        self._where = addresses(self._scene(0).model, hand)
+        self._where = addresses(self._compiled[0].model, hand)
 
     def start(self, reset_state: ResetState) -> "NativePhysics":
         """Starts environments; see `Physics.start`.
@@ -107,7 +112,8 @@ class NativePhysics:
                 f"{free / 1e9:.0f} GB are free.",
                 "Pass a smaller --environments, or run the actor on a GPU.",
             )
-        self.scenes = [self._scene(int(index)) for index in np.asarray(reset_state.object_index)]
+        indices = np.asarray(reset_state.object_index)
+        self.scenes = [self._compiled[int(index)] for index in indices]
         self.instances = [scene.take() for scene in self.scenes]
         model = self.instances[0].model
         self._start = np.zeros((batch, model.nq))
@@ -120,7 +126,7 @@ class NativePhysics:
 
     def reset(self, state: Any, mask: Any, reset_state: ResetState) -> "NativePhysics":
         """Restarts the masked environments; see `Physics.reset`."""
-        reset_state = ResetState(*(np.asarray(leaf) for leaf in reset_state))
+        reset_state = host_arrays(reset_state)
         for i in np.flatnonzero(np.asarray(mask)):
             self._start_instance(int(i), reset_state)
         return self
@@ -158,8 +164,7 @@ class NativePhysics:
 
     def replace_objects(self, state: Any, objects: Sequence[GraspObject]) -> "NativePhysics":
         """Replaces the objects; see `Physics.replace_objects`."""
-        self._objects = objects
-        self._compiled.clear()
+        self._compiled.replace(objects)
         return self
 
     def read(self, state: Any) -> PhysicsState:
@@ -170,19 +175,12 @@ class NativePhysics:
         """Stops the threads."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
-    def _scene(self, index: int) -> Scene:
-        """Returns the compiled scene of an object, compiling it on first use."""
-        if index not in self._compiled:
-            model = compile_scene(self._hand, self._task, self._objects[index])
-            self._compiled[index] = Scene(model)
-        return self._compiled[index]
-
     def _start_instance(self, i: int, reset_state: ResetState) -> None:
         """Places environment i at row i of its reset states, in an instance of its object's
         scene.
         """
         where = self._where
-        scene = self._scene(int(reset_state.object_index[i]))
+        scene = self._compiled[int(reset_state.object_index[i])]
         self.scenes[i].spare.append(self.instances[i])
         instance = scene.take()
         self.scenes[i] = scene

@@ -6,19 +6,15 @@ import concurrent.futures
 import contextlib
 import importlib
 import logging
-import multiprocessing.connection
-import multiprocessing.spawn
+import multiprocessing
 import os
-import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterable, Sequence
-from multiprocessing.reduction import ForkingPickler
-from typing import IO, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from congrasp.common.runtime import platforms
-from congrasp.common.runtime.environment import child_environment
 from congrasp.common.runtime.resources import cores
+from congrasp.common.runtime.worker_process import Messages, WorkerProcess, decode
 
 Result = TypeVar("Result")
 _log = logging.getLogger(__name__)
@@ -35,11 +31,6 @@ _PRELOADED = ("congrasp.common.objects.procedural", "congrasp.common.task.constr
 """Modules imported once, before workers fork; workers import anything else their functions
 need.
 """
-_ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"), "1")
-"""Environment of workers, whatever that of this process: each would otherwise start a thread for
-every core, for products so small that the threads cost several times the work."""
-_LENGTH_BYTES = 8
-"""Size of the length before each message."""
 
 
 class _Done(NamedTuple):
@@ -108,28 +99,16 @@ def _worker_count(calls: int) -> int:
     return workers if workers > 1 else 0
 
 
-class _Process(NamedTuple):
-    """The helper's process and its standard streams."""
-
-    process: subprocess.Popen[bytes]
-    requests: IO[bytes]
-    """Standard input, for the messages of the caller."""
-    answers: IO[bytes]
-    """Standard output, with the messages of the helper."""
-
-
 class _Helper:
     """A process that starts workers: forking this one could deadlock if it has started JAX.
 
-    Other ways of Python to start workers would import the caller's `__main__` in each of them, and
-    its fork server is shared with the caller's own use. Messages pass through the helper's standard
-    input and output.
+    The fork server of Python would be shared with the caller's own use.
     """
 
     def __init__(self) -> None:
         """Does not start the process yet."""
         self._lock = threading.Lock()
-        self._process: _Process | None = None
+        self._process: WorkerProcess | None = None
 
     def start(self) -> None:
         """Starts the process if it is not running."""
@@ -144,8 +123,8 @@ class _Helper:
             try:
                 request = _Request(os.getpid(), os.getcwd(), workers, function, rows)
                 helper = self._ensure_started()
-                _send(helper.requests, request)
-                outcomes: _Outcomes | None = _receive(helper.answers)
+                helper.send(request)
+                outcomes: _Outcomes | None = helper.receive()
                 return outcomes
             except (OSError, EOFError):  # it cannot start here, or was killed
                 self._stop()
@@ -154,20 +133,10 @@ class _Helper:
                 self._stop()
                 raise
 
-    def _ensure_started(self) -> _Process:
+    def _ensure_started(self) -> WorkerProcess:
         """Returns the process, and starts it if necessary."""
         if self._process is None:
-            paths = [str(path) for path in sys.path]
-            code = f"import sys; sys.path[:] = {paths}; from {__name__} import serve; serve()"
-            process = subprocess.Popen(
-                [multiprocessing.spawn.get_executable(), "-P", "-c", code],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                env=child_environment(**_ONE_THREAD, JAX_PLATFORMS="cpu", PYTHONWARNINGS="ignore"),
-                **platforms.separate_session(),  # Ctrl-C on a terminal reaches only the caller
-            )
-            assert process.stdin is not None and process.stdout is not None
-            self._process = _Process(process, process.stdin, process.stdout)
+            self._process = WorkerProcess(serve)
         return self._process
 
     def _stop(self) -> None:
@@ -176,50 +145,7 @@ class _Helper:
             return
         helper = self._process
         self._process = None
-        helper.process.kill()
-        for pipe in (helper.requests, helper.answers):
-            with contextlib.suppress(OSError):  # the rest of a message
-                pipe.close()
-        helper.process.wait()
-
-
-def _send(pipe: IO[bytes], message: Any) -> None:
-    """Writes a message.
-
-    Raises:
-      OSError: the process at the other end is gone.
-    """
-    data = ForkingPickler.dumps(message)
-    pipe.write(len(data).to_bytes(_LENGTH_BYTES, "little"))
-    pipe.write(data)
-    pipe.flush()
-
-
-def _receive(pipe: IO[bytes]) -> Any:
-    """Reads a message.
-
-    Raises:
-      EOFError: the process at the other end is gone.
-    """
-    return ForkingPickler.loads(_receive_bytes(pipe))
-
-
-def _receive_bytes(pipe: IO[bytes]) -> bytes:
-    """Reads the pickled bytes of a message.
-
-    Raises:
-      EOFError: the process at the other end is gone.
-    """
-    length = int.from_bytes(_read(pipe, _LENGTH_BYTES), "little")
-    return _read(pipe, length)
-
-
-def _read(pipe: IO[bytes], count: int) -> bytes:
-    """Reads bytes; raises an EOFError if there are fewer."""
-    data = pipe.read(count)
-    if len(data) < count:
-        raise EOFError
-    return data
+        helper.stop()
 
 
 _helpers: dict[int, _Helper] = {}
@@ -230,34 +156,28 @@ def _helper() -> _Helper:
     return _helpers.setdefault(os.getpid(), _Helper())
 
 
-def serve() -> None:
-    """Answers the requests of the process at the other end of the standard streams, until it ends.
-
-    The output of the calls goes to the standard error.
-    """
-    requests = sys.stdin.buffer
-    with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as answers:
-        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-        for module in _PRELOADED:
-            importlib.import_module(module)
-        with contextlib.suppress(EOFError, OSError):
-            while True:
-                _answer(requests, answers)
+def serve(caller: Messages) -> None:
+    """Answers the requests of the process at the other end, until it ends."""
+    for module in _PRELOADED:
+        importlib.import_module(module)
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            _answer(caller)
 
 
-def _answer(requests: IO[bytes], answers: IO[bytes]) -> None:
+def _answer(caller: Messages) -> None:
     """Answers one request by the outcomes of its calls, or by None if no call can be made.
 
     Raises:
       EOFError, OSError: the process at the other end is gone.
     """
-    data = _receive_bytes(requests)
+    data = caller.receive_bytes()
     outcomes: _Outcomes | None = None
     # Fails for a class of the caller's `__main__`, for a folder that was deleted, or if a worker
     # was killed or cannot start.
     with contextlib.suppress(Exception):
-        outcomes = _run_calls(ForkingPickler.loads(data))
-    _send(answers, outcomes)
+        outcomes = _run_calls(decode(data))
+    caller.send(outcomes)
 
 
 def _run_calls(request: _Request) -> _Outcomes:

@@ -49,7 +49,7 @@ class Actor:
     physics: PhysicsName = "auto"
     """Physics engine; auto takes warp on an NVIDIA GPU and native on a CPU."""
     threads: int = 0
-    """Number of threads of the native engine; 0 uses all cores."""
+    """Number of threads of the native engine, and of processes of PhysX; 0 uses all cores."""
     patience: float | None = None
     """Seconds for which the actor waits for a disconnected learner; without limit by default."""
     audit: pathlib.Path | None = None

@@ -5,6 +5,7 @@ import importlib.util
 
 import mujoco
 import numpy as np
+import psutil
 import pytest
 
 from congrasp.actors.physics import make_physics
@@ -30,6 +31,7 @@ from congrasp.actors.physics.physx.units import LENGTH
 GRAVITY = 9.81
 BOX = procedural.generate(0, "box")
 FINGERS = len(HAND.joints)
+OBJECTS = [procedural.generate(i, family) for i, family in enumerate(("box", "mug", "bowl"))]
 FAR = np.array([[0.0, 0.5, 0.6]])
 
 
@@ -38,8 +40,8 @@ def physx():
     """Makes PhysX engines, and closes them."""
     engines = []
 
-    def make(objects=(BOX,), hand=HAND, task=TASK, threads=1):
-        engines.append(PhysxPhysics(hand, task, objects, threads))
+    def make(objects=(BOX,), hand=HAND, task=TASK):
+        engines.append(PhysxPhysics(hand, task, objects))
         return engines[-1]
 
     yield make
@@ -304,15 +306,67 @@ def on_the_table(objects):
     return type(start)(*(np.concatenate(fields) for fields in zip(*starts, strict=True)))
 
 
-def test_results_depend_on_neither_threads_nor_earlier_episodes(physx):
-    objects = [procedural.generate(i, family) for i, family in enumerate(("box", "mug", "bowl"))]
-    start = on_the_table(objects)
-    one_thread = grasps(physx(objects), start)
-    used = physx(objects, threads=3)
+def assert_equal_states(first, second):
+    for before, after in zip(first, second, strict=True):
+        for name, values, others in zip(before._fields, before, after, strict=True):
+            np.testing.assert_array_equal(values, others, err_msg=name)
+
+
+def test_results_do_not_depend_on_earlier_episodes(physx):
+    start = on_the_table(OBJECTS)
+    used = physx(OBJECTS)
     grasps(used, start._replace(mass_scale=np.full(3, 3.0), object_index=np.array([2, 0, 1])))
-    for first, second in zip(one_thread, grasps(used, start), strict=True):
-        for name, values, again in zip(first._fields, first, second, strict=True):
-            np.testing.assert_array_equal(values, again, err_msg=name)
+    assert_equal_states(grasps(physx(OBJECTS), start), grasps(used, start))
+
+
+@pytest.fixture
+def processes():
+    """An engine of three processes."""
+    engine = make_physics("physx", HAND, TASK, OBJECTS, threads=3)
+    yield engine
+    engine.close()
+
+
+def start_of_batch(batch):
+    """Starts of `grasps` with different masses, on all objects."""
+    rows = np.arange(batch) % len(OBJECTS)
+    start = on_the_table(OBJECTS)
+    start = type(start)(*(np.asarray(field)[rows] for field in start))
+    return start._replace(mass_scale=np.linspace(0.5, 2.0, batch))
+
+
+def test_results_do_not_depend_on_processes(physx, processes):
+    """With a number of environments that the processes do not share evenly, pushes, and resets."""
+    batch = 32
+    start = start_of_batch(batch)
+    mask = np.arange(batch) % 5 == 0
+    force = np.random.default_rng(0).normal(size=(batch, 3))
+    results = []
+    for engine in (physx(OBJECTS), processes):
+        states = grasps(engine, start, steps=25)
+        engine.reset(engine, mask, start)
+        states.append(engine.read(engine))
+        target = np.tile(targets(), (batch, 1))
+        states.append(engine.step(engine, target, np.ones(batch, bool), force)[1])
+        engine.replace_objects(engine, OBJECTS[::-1])
+        engine.reset(engine, mask, start)
+        states.append(engine.step(engine, target, mask)[1])
+        results.append(states)
+    assert_equal_states(*results)
+
+
+def test_an_ended_process_is_an_error(processes):
+    start = start_of_batch(32)
+    before = psutil.Process().children()
+    processes.start(start)
+    workers = [child for child in psutil.Process().children() if child not in before]
+    assert len(workers) == 2
+    workers[1].kill()
+    with pytest.raises(CongraspError, match="has ended"):
+        grasps(processes, start)
+    assert not any(worker.is_running() for worker in workers)
+    # It can be used again
+    processes.start(start)
 
 
 def test_a_diverged_environment_is_marked_and_put_back(physx):

@@ -1,37 +1,41 @@
-"""A batch of environments in PhysX on threads."""
+"""A batch of environments in PhysX, stepped one after another in this process."""
 
-import concurrent.futures
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from congrasp.actors.physics.engine import PhysicsState, ResetState, has_diverged
+from congrasp.actors.physics.compiled_objects import CompiledObjects
+from congrasp.actors.physics.engine import PhysicsState, ResetState, has_diverged, host_arrays
 from congrasp.actors.physics.physx.collisions import collisions
 from congrasp.actors.physics.physx.contacts import ContactReader
 from congrasp.actors.physics.physx.environment import CompiledScene, Environment
 from congrasp.actors.physics.physx.transmission import couplings_of, servos_of
-from congrasp.actors.physics.scene import addresses, compile_scene
+from congrasp.actors.physics.scene import addresses
 from congrasp.common.hands.spec import Hand
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.runtime.physics_library import mujoco
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.types import CONTACTS_PER_LINK
 
 
 class PhysxPhysics:
-    """A batch of environments in PhysX. Its state is this object; calls mutate it."""
+    """A batch of environments in PhysX. Its state is this object; calls mutate it.
+
+    sapien never releases the interpreter's lock, so that threads gain nothing: `PhysxProcesses` has
+    a batch in each of several processes.
+    """
 
     name = "physx"
     compiled = False
 
-    def __init__(self, hand: Hand, task: TaskConfig, objects: Sequence[GraspObject], threads: int):
+    def __init__(self, hand: Hand, task: TaskConfig, objects: Sequence[GraspObject]):
         """Creates the engine; objects are compiled on first use.
 
         Args:
           hand: the hand.
           task: timing and collision settings.
           objects: the pool indexed by `ResetState.object_index`.
-          threads: threads that step environments in parallel.
 
         Raises:
           CongraspError: PhysX lacks something that the hand has: too many links, a joint with two
@@ -39,22 +43,17 @@ class PhysxPhysics:
         """
         self._hand = hand
         self._task = task
-        self._objects = objects
-        self.threads = max(1, threads)
-        self._pool = concurrent.futures.ThreadPoolExecutor(
-            self.threads, thread_name_prefix="physics"
-        )
-        self._compiled: dict[int, CompiledScene] = {}
+        self._compiled = CompiledObjects(hand, task, objects, self._scene)
         self.environments: list[Environment] = []
         self._readers: list[ContactReader] = []
-        scene = self._scene(0)
+        scene = self._compiled[0]
         servos_of(scene.model)
         couplings_of(scene.model)
         self._where = scene.where
 
     def start(self, reset_state: ResetState) -> "PhysxPhysics":
         """Starts environments; see `Physics.start`."""
-        reset_state = _rows(reset_state)
+        reset_state = host_arrays(reset_state)
         batch = len(reset_state.object_index)
         self.environments = []
         self._readers = []
@@ -75,7 +74,7 @@ class PhysxPhysics:
 
     def reset(self, state: Any, mask: Any, reset_state: ResetState) -> "PhysxPhysics":
         """Restarts the masked environments; see `Physics.reset`."""
-        reset_state = _rows(reset_state)
+        reset_state = host_arrays(reset_state)
         for i in np.flatnonzero(np.asarray(mask)):
             self._replace(int(i), self._environment(reset_state, int(i)))
         return self
@@ -89,16 +88,7 @@ class PhysxPhysics:
         for environment, present in zip(self.environments, np.asarray(table), strict=True):
             environment.place_table(bool(present))
         pushes = None if force is None else np.asarray(force, np.float32)
-        # Threads take environments from one shared iterator, since contacts make some slower than
-        # others. sapien releases the interpreter's lock during a physics step.
-        remaining = iter(range(len(self.environments)))
-        steps = []
-        for _ in range(self.threads):
-            steps.append(
-                self._pool.submit(self._step_environments, remaining, np.asarray(target), pushes)
-            )
-        for step in steps:
-            step.result()
+        self._step_environments(np.asarray(target), pushes)
         diverged = has_diverged(np, self._qpos, self._qvel)
         for i in np.flatnonzero(diverged):
             environment = self.environments[i]
@@ -107,8 +97,7 @@ class PhysxPhysics:
 
     def replace_objects(self, state: Any, objects: Sequence[GraspObject]) -> "PhysxPhysics":
         """Replaces the objects; see `Physics.replace_objects`."""
-        self._objects = objects
-        self._compiled.clear()
+        self._compiled.replace(objects)
         return self
 
     def read(self, state: Any) -> PhysicsState:
@@ -116,24 +105,19 @@ class PhysxPhysics:
         return self._current_state(np.zeros(len(self.environments), bool))
 
     def close(self) -> None:
-        """Stops the threads, and frees the scenes."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        """Frees the scenes."""
         self.environments = []
         self._readers = []
 
-    def _scene(self, index: int) -> CompiledScene:
-        """Returns the compiled scene of an object, compiling it on first use."""
-        if index not in self._compiled:
-            model = compile_scene(self._hand, self._task, self._objects[index])
-            links = tuple(model.body(link.name).id for link in self._hand.links)
-            where = addresses(model, self._hand)
-            self._compiled[index] = CompiledScene(model, where, collisions(model), links)
-        return self._compiled[index]
+    def _scene(self, model: mujoco.MjModel) -> CompiledScene:
+        """Returns what environments share of the compiled scene of an object."""
+        links = tuple(model.body(link.name).id for link in self._hand.links)
+        return CompiledScene(model, addresses(model, self._hand), collisions(model), links)
 
     def _environment(self, reset_state: ResetState, i: int) -> Environment:
         """Builds environment i at row i of the reset states."""
         start = ResetState(*(leaf[i].copy() for leaf in reset_state))
-        return Environment(self._scene(int(start.object_index)), start)
+        return Environment(self._compiled[int(start.object_index)], start)
 
     def _replace(self, i: int, environment: Environment) -> None:
         """Replaces environment i by another at its start, without contacts."""
@@ -143,13 +127,10 @@ class PhysxPhysics:
         self._contact_force[i] = 0.0
         environment.read(self._qpos[i], self._qvel[i])
 
-    def _step_environments(
-        self, remaining: Iterator[int], target: np.ndarray, pushes: np.ndarray | None
-    ) -> None:
-        """Steps environments from a shared iterator until it is exhausted; runs in each thread."""
-        for i in remaining:
+    def _step_environments(self, target: np.ndarray, pushes: np.ndarray | None) -> None:
+        """Steps all environments, and reads their states and contacts into the batch's arrays."""
+        for i, environment in enumerate(self.environments):
             push = None if pushes is None else pushes[i]
-            environment = self.environments[i]
             environment.step(target[i], self._task.substeps, push)
             environment.read(self._qpos[i], self._qvel[i])
             self._readers[i].read(
@@ -175,8 +156,3 @@ class PhysxPhysics:
             diverged=diverged,
             occupancy=np.zeros(3, np.float32),
         )
-
-
-def _rows(reset_state: ResetState) -> ResetState:
-    """Reset states as NumPy arrays."""
-    return ResetState(*(np.asarray(leaf) for leaf in reset_state))
