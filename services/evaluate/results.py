@@ -1,17 +1,17 @@
-"""Published figures: the files of `docs/results`, and the tables of them in pages.
+"""Tables of published figures: those of the files of `docs/results`, in pages.
 
 `congrasp evaluate … --json docs/results/NAME.json` writes a file. `python -m
 congrasp.services.evaluate.results` writes each table between `<!-- results NAME KIND -->` and `<!--
-end of results -->` in the README and in `docs`. KIND is one of `KINDS`.
+end of results -->` in the README and in `docs`. KIND is one of `KINDS`, or `engines` for a table of
+the hand NAME in several engines (`engine_table`).
 """
 
-import dataclasses
 import pathlib
 import platform
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import jax
@@ -19,7 +19,6 @@ import jax
 import congrasp
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
-from congrasp.common.io.inputs import read_json
 from congrasp.common.runtime.engines import engine_title
 from congrasp.common.runtime.resources import cores
 from congrasp.services.evaluate.columns import (
@@ -29,76 +28,32 @@ from congrasp.services.evaluate.columns import (
     posture_columns,
     row_title,
 )
+from congrasp.services.evaluate.engine_table import engine_table
 from congrasp.services.evaluate.heading_rules import HeadingRules
+from congrasp.services.evaluate.published import ROOT, Results, read_all_results
 from congrasp.services.evaluate.scores import Row
 from congrasp.services.evaluate.text_table import Columns, Table, percent
 
-ROOT = pathlib.Path(__file__).resolve().parents[2]
-FOLDER = pathlib.Path("docs", "results")
 _BLOCK = re.compile(r"(<!-- results (\S+) (\S+) -->\n).*?(<!-- end of results -->)", re.S)
-_MAX_FILE_BYTES = 1 << 26
-_REQUIRED = (
-    "command",
-    "heading_rules",
-    "machine",
-    "objects",
-    "physics",
-    "policies",
-    "version",
-)
-"""Required content of a file in addition to its rows."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Results:
-    """A file of results."""
+def provenance(accelerators: str = "") -> dict[str, Any]:
+    """Version of the package, command line and machine of the current evaluation.
 
-    rows: Sequence[Row]
-    about: Mapping[str, Any]
-    """Further content of the file from `congrasp evaluate --json`."""
-
-    @property
-    def policies(self) -> dict[str, str]:
-        """SHA-256 of each policy by file name."""
-        return {policy["file"]: policy["sha256"] for policy in self.about["policies"]}
-
-
-def provenance() -> dict[str, Any]:
-    """Version of the package, command line and machine of the current evaluation."""
+    Args:
+      accelerators: their names, by default those of this process.
+    """
     device = jax.local_devices()[0]
+    if not accelerators and device.platform != "cpu":
+        accelerators = device.device_kind
     machine = f"{cores()} {platform.machine()} cores"
-    if device.platform != "cpu":
-        machine = f"{machine}, {device.device_kind}"
+    if accelerators:
+        machine = f"{machine}, {accelerators}"
     return {
         "version": congrasp.__version__,
         "command": shlex.join(["congrasp", *sys.argv[1:]]),
         "machine": machine,
     }
-
-
-def read_results(file: pathlib.Path) -> Results:
-    """Reads the rows of a file and their provenance.
-
-    Raises:
-      CongraspError: the file cannot be read, or another version of the project wrote it.
-    """
-    remedy = "Run the command that wrote it again."
-    try:
-        about = read_json(file, _MAX_FILE_BYTES, remedy)
-        rows = [Row.from_json(row) for row in about.pop("rows")]
-    except (LookupError, TypeError, AttributeError):
-        raise CongraspError(
-            f"{file} is not a results file of this version of congrasp.", remedy
-        ) from None
-    for name in _REQUIRED:
-        if name not in about:
-            raise CongraspError(f"{file} lacks '{name}'.", remedy)
-    return Results(rows, about)
-
-
-def read_all_results(root: pathlib.Path = ROOT) -> dict[str, Results]:
-    """Reads all files of results, by name."""
-    return {file.stem: read_results(file) for file in sorted((root / FOLDER).glob("*.json"))}
 
 
 def summary(results: Results) -> list[str]:
@@ -177,6 +132,15 @@ KINDS: dict[str, Callable[[Results], list[str]]] = {
     function.__name__: function for function in (summary, rates, plausibility, conditions, headings)
 }
 """Tables of a file of results available to pages, as lines of Markdown."""
+_ENGINES = "engines"
+"""Kind of the table of several files (`engine_table`)."""
+
+
+def _table(kind: str, results: Mapping[str, Results], name: str) -> list[str]:
+    """Returns the lines of a table."""
+    if kind == _ENGINES:
+        return engine_table(results, name)
+    return KINDS[kind](results[name])
 
 
 def fill_tables(page: str, results: Mapping[str, Results], name: str = "page") -> str:
@@ -189,13 +153,12 @@ def fill_tables(page: str, results: Mapping[str, Results], name: str = "page") -
     def block(match: re.Match[str]) -> str:
         """Returns one table between its markers."""
         opening, file, kind, closing = match.groups()
-        if file not in results or kind not in KINDS:
+        if file not in results or kind not in (*KINDS, _ENGINES):
             raise CongraspError(
                 f"{name} names '{file} {kind}', which does not exist.",
-                f"Files: {', '.join(results)}; tables: {', '.join(KINDS)}.",
+                f"Files: {', '.join(results)}; tables: {', '.join((*KINDS, _ENGINES))}.",
             )
-        lines = "\n".join(KINDS[kind](results[file]))
-        return f"{opening}\n{lines}\n\n{closing}"
+        return "\n".join([opening, *_table(kind, results, file), "", closing])
 
     return _BLOCK.sub(block, page)
 

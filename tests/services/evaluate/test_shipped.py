@@ -9,7 +9,7 @@ from congrasp.common.policy.pretrained import policy_file, pretrained_hands
 from congrasp.services.evaluate.exams import exam_pool
 from congrasp.services.evaluate.experiment import Experiment, Variation
 from congrasp.services.evaluate.intervals import NORMAL_95
-from congrasp.services.evaluate.results import read_all_results
+from congrasp.services.evaluate.published import read_all_results
 
 _SIGMAS = 3
 """Standard deviations of each bound: with two, one of the thirty that are checked would break half
