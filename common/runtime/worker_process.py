@@ -82,12 +82,13 @@ def decode(data: bytes) -> Any:
 class WorkerProcess:
     """A process that serves this one. It ends when this one does."""
 
-    def __init__(self, serve: Callable[[Messages], None]):
+    def __init__(self, serve: Callable[[Messages], None], **variables: str):
         """Starts the process.
 
         Args:
           serve: top-level function of a module of this library; it runs in the process, which ends
             with it. It must return when its messages end.
+          variables: further variables of its environment. JAX has the CPU alone by default.
 
         Raises:
           OSError: the process cannot start.
@@ -97,7 +98,8 @@ class WorkerProcess:
             f"import sys; sys.path[:] = {paths}; from {__name__} import run; "
             f"run({serve.__module__!r}, {serve.__name__!r})"
         )
-        environment = child_environment(**_ONE_THREAD, JAX_PLATFORMS="cpu", PYTHONWARNINGS="ignore")
+        variables = {"JAX_PLATFORMS": "cpu", "PYTHONWARNINGS": "ignore", **variables}
+        environment = child_environment(**_ONE_THREAD, **variables)
         self._process = subprocess.Popen(
             [multiprocessing.spawn.get_executable(), "-P", "-c", code],
             stdin=subprocess.PIPE,

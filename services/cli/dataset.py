@@ -27,7 +27,8 @@ class Dataset:
 
     Every episode is simulated to its end: the object is held for two seconds without the table,
     lifted by 15 cm, and pushed. Repeat an interrupted command to make the missing shards. The same
-    policy, objects, seed, engine and batch give the same shards.
+    policy, objects, seed, engine and batch give the same shards. All GPUs of the machine are used:
+    each makes some of the shards.
 
     Examples:
       congrasp dataset meshes/ --out grasps --per-object 100
@@ -73,17 +74,21 @@ class Dataset:
     def __call__(self) -> int:
         """Makes the missing shards, and the card."""
         from congrasp.services.dataset.card import write_card
+        from congrasp.services.dataset.gpus import make_on_gpus
         from congrasp.services.dataset.make import make, pools_of
         from congrasp.services.dataset.shards import CARD, Shards
         from congrasp.services.evaluate.results import provenance
+        from congrasp.services.train.accelerators import several_gpus
 
         in_range(1, per_object=self.per_object)
         in_range(0, shard=self.shard, batch=self.batch)
         part, parts = _part(self.part)
-        recipe = self._recipe()
+        gpus = several_gpus(self.physics)
+        recipe = self._recipe(gpus is not None)
         pools = pools_of(recipe)
         shards = Shards(self.out, len(pools.loaders), recipe.columns)
-        facts = {"licence": self.licence, **provenance()}
+        accelerators = "" if gpus is None else f"{len(gpus.names)} x {gpus.kind}"
+        facts = {"licence": self.licence, **provenance(accelerators)}
         finished = shards.finished(recipe.about)
         if (self.out / CARD).exists():
             # Drops the checksums of deleted shards: on a GPU a shard made again may differ.
@@ -93,7 +98,10 @@ class Dataset:
         with tracked() as track:
             objects = min(len(recipe.objects), pools.pool_size * len(missing))
             advance = track("Episodes", objects * self.per_object)
-            make(recipe, shards, pools, missing, advance)
+            if gpus is None or not missing:
+                make(recipe, shards, pools, missing, advance)
+            else:
+                make_on_gpus(recipe, shards, missing, gpus.names, advance)
         card = write_card(shards, recipe.about, facts)
         counts = card["counts"].values()
         episodes = sum(count["episodes"] for count in counts)
@@ -104,24 +112,27 @@ class Dataset:
         )
         return 0
 
-    def _recipe(self) -> "Recipe":
+    def _recipe(self, on_gpus: bool) -> "Recipe":
         """Returns the content of all shards: policy, objects, constraints, episodes of each.
+
+        Args:
+          on_gpus: True if other processes simulate on GPUs, which this one does not see.
 
         Raises:
           CongraspError: there is no such object, policy or constraint, or a shard is too large for
             the engine.
         """
-        from congrasp.actors.physics import resolve_physics
         from congrasp.common.policy import bundle as bundles
         from congrasp.common.policy.pretrained import policy_file
         from congrasp.services.dataset.make import Recipe, shard_objects
         from congrasp.services.evaluate.experiment import Experiment
         from congrasp.services.evaluate.pools import max_objects_with_meshes
+        from congrasp.services.train.accelerators import engine_of
 
         objects = self._objects()
         file = policy_file(self.policy, self.hand)
         bundle = bundles.load(file)
-        engine = resolve_physics(self.physics)
+        engine = engine_of(self.physics, on_gpus)
         in_range(0, max_objects_with_meshes(engine), "objects", shard=self.shard)
         outcomes = dict.fromkeys(self.keep)
         return Recipe(

@@ -1,16 +1,43 @@
 """Accelerators of this machine, found without holding their memory in this process."""
 
+import os
+import pathlib
 import subprocess
 import sys
+from typing import NamedTuple
 
 from congrasp.actors.physics import resolve_physics
 from congrasp.common.errors import CongraspError
-from congrasp.common.runtime.engines import PhysicsName
+from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.runtime.environment import child_environment
 from congrasp.common.runtime.lazy_jax import jax
 from congrasp.common.runtime.stages import stage
 
 _START_TIMEOUT_S = 120.0
+DEVICES = pathlib.Path("/dev")
+"""Folder of Linux with a file for each GPU, `nvidia0` and so on."""
+_GPUS = ("gpu", "cuda")
+"""JAX's names of NVIDIA GPUs."""
+
+
+class Hardware(NamedTuple):
+    """JAX's hardware on this machine."""
+
+    backend: str
+    """JAX's name, such as `cpu` or `gpu`."""
+    devices: int
+    """Number of devices."""
+    kind: str
+    """Name of a device, such as `NVIDIA H200`."""
+
+
+class Gpus(NamedTuple):
+    """Several GPUs of this machine."""
+
+    names: tuple[str, ...]
+    """Their identifiers for CUDA."""
+    kind: str
+    """Name of one, such as `NVIDIA H200`."""
 
 
 def leave_gpus_to(ranks: int) -> bool:
@@ -21,26 +48,59 @@ def leave_gpus_to(ranks: int) -> bool:
       CongraspError: there are fewer GPUs than ranks, but not none.
     """
     with stage("search for accelerators"):
-        backend, count = detect()
-    if backend == "cpu":
+        hardware = detect()
+    if hardware.backend == "cpu":
         return False
-    if count < ranks:
+    if hardware.devices < ranks:
         raise CongraspError(
-            f"{ranks} ranks need {ranks} GPUs, but JAX finds {count}.", "Pass a smaller --ranks."
+            f"{ranks} ranks need {ranks} GPUs, but JAX finds {hardware.devices}.",
+            "Pass a smaller --ranks.",
         )
     jax.config.update("jax_platforms", "cpu")
     return True
 
 
-def detect() -> tuple[str, int]:
-    """Returns JAX's name of this machine's hardware, and its number of devices.
+def several_gpus(physics: PhysicsName) -> Gpus | None:
+    """Returns the GPUs of this machine if there are several and the engine steps on one; this
+    process then uses none, so that others have all memory. Takes no time without GPUs.
+
+    Raises:
+      CongraspError: JAX does not start.
+    """
+    engines_on_gpus = [name for name, engine in ENGINES.items() if engine.on_device]
+    if physics not in ("auto", *engines_on_gpus):
+        return None
+    if len(list(DEVICES.glob("nvidia[0-9]*"))) < 2:
+        return None
+    hardware = detect()
+    if hardware.backend not in _GPUS or hardware.devices < 2:
+        return None
+    jax.config.update("jax_platforms", "cpu")
+    names = [gpu_of_rank(rank) for rank in range(hardware.devices)]
+    return Gpus(tuple(names), hardware.kind)
+
+
+def gpu_of_rank(rank: int) -> str:
+    """Returns the identifier of a rank's GPU for CUDA, among those available to this process."""
+    names = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
+    visible = [name for name in names if name]
+    if not visible:
+        return str(rank)
+    return visible[rank]
+
+
+def detect() -> Hardware:
+    """Returns the hardware that JAX finds on this machine.
 
     A separate process checks this, since a process that initialises a GPU holds memory of it.
 
     Raises:
       CongraspError: JAX does not start.
     """
-    code = "import jax; print(jax.default_backend(), jax.local_device_count())"
+    code = (
+        "import jax; devices = jax.local_devices(); "
+        "print(jax.default_backend(), len(devices), devices[0].device_kind)"
+    )
     environment = child_environment(XLA_PYTHON_CLIENT_PREALLOCATE="false")
     try:
         result = subprocess.run(
@@ -50,12 +110,12 @@ def detect() -> tuple[str, int]:
             text=True,
             timeout=_START_TIMEOUT_S,
         )
-        backend, count = result.stdout.split()
+        backend, count, kind = result.stdout.strip().split(maxsplit=2)
     except (subprocess.TimeoutExpired, ValueError):
         raise CongraspError(
             "JAX does not start on this machine.", "Run 'congrasp doctor' for the cause."
         ) from None
-    return backend, int(count)
+    return Hardware(backend, int(count), kind)
 
 
 def engine_of(name: PhysicsName, gpus: bool) -> PhysicsName:

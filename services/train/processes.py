@@ -1,6 +1,5 @@
 """Processes of a training on this machine: learners and actors, which are restarted if they die."""
 
-import os
 import pathlib
 import shlex
 import threading
@@ -17,6 +16,7 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import reachable_url
 from congrasp.learner.run_directory import LOGS
 from congrasp.services.ops.lifetime import CHILD_GRACE_S, Child, command, end_all, wait_for
+from congrasp.services.train.accelerators import gpu_of_rank
 from congrasp.services.train.launch import LaunchRecord, Plan, write_launch
 
 MAX_RESTARTS = 5
@@ -119,15 +119,6 @@ def _actors(logs: pathlib.Path, record: LaunchRecord, launch_file: pathlib.Path)
         arguments = command("actor", launch=launch_file, id=name)
         actors.append(Child(name, arguments, logs / f"{name}.log"))
     return actors
-
-
-def gpu_of_rank(rank: int) -> str:
-    """Returns the identifier of a rank's GPU for CUDA, among those available to this process."""
-    names = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
-    visible = [name for name in names if name]
-    if not visible:
-        return str(rank)
-    return visible[rank]
 
 
 def _connect(

@@ -2,6 +2,7 @@
 what they say.
 """
 
+import concurrent.futures
 import hashlib
 import json
 import os
@@ -15,6 +16,7 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
+import psutil
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -27,6 +29,7 @@ from congrasp.common.objects.procedural import generate
 from congrasp.services.assets.objects.named import objects_at
 from congrasp.services.dataset.shards import CARD
 from congrasp.services.evaluate import plan
+from congrasp.services.train.accelerators import Gpus
 from tests.waits import eventually
 
 ROOT = pathlib.Path(__file__).resolve().parents[3]
@@ -132,6 +135,47 @@ def test_a_killed_run_and_parts_make_the_same_shards(tmp_path_factory, tmp_path,
     assert contents(tmp_path) == contents(dataset)
     assert card["counts"] == json.loads((dataset / CARD).read_text())["counts"]
     assert card["shards"] == {"finished": 2, "of": 2}
+
+
+@pytest.fixture
+def two_cards(monkeypatch):
+    """Simulates a machine with two GPUs, on which the engine runs on the CPU as before."""
+    gpus = Gpus(("0", "1"), "Card 9000")
+    monkeypatch.setattr("congrasp.services.train.accelerators.several_gpus", lambda physics: gpus)
+
+
+@pytest.mark.slow
+def test_several_gpus_make_the_same_shards(tmp_path_factory, tmp_path, monkeypatch, request):
+    monkeypatch.setattr(plan, "REQUIRED_HOLD_S", 2.0)  # as in the processes
+    monkeypatch.setattr(stress, "PUSH_S", 0.25)
+    alone = made(dataset := tmp_path_factory.mktemp("whole"))
+    request.getfixturevalue("two_cards")
+    card = made(tmp_path)
+    assert contents(tmp_path) == contents(dataset)
+    assert card["counts"] == alone["counts"]
+    assert card["shards"] == {"finished": 2, "of": 2}
+    assert card["machine"].endswith(", 2 x Card 9000")
+    assert card["command"] == alone["command"]
+
+
+def test_a_killed_process_of_a_gpu_ends_the_command(two_cards, tmp_path):
+    this = psutil.Process()
+    before = this.children()
+
+    def workers():
+        return [child for child in this.children() if child not in before]
+
+    def kill_one():
+        eventually(lambda: len(workers()) == 2, 0.01)
+        workers()[0].kill()
+
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        killed = pool.submit(kill_one)
+        with pytest.raises(CongraspError, match=r"The process of GPU \d ended"):
+            made(tmp_path)
+        killed.result()
+    assert not workers()
+    assert not (tmp_path / CARD).exists()
 
 
 def test_rows_have_requests_and_outcomes(dataset, columns):

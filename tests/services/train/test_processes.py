@@ -11,7 +11,7 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message
 from congrasp.services.ops.lifetime import command
-from congrasp.services.train import processes
+from congrasp.services.train import accelerators, processes
 from congrasp.services.train.processes import MAX_RESTARTS, Child
 
 WAITS = "import time; time.sleep(60)"
@@ -166,4 +166,4 @@ def test_deaths_without_progress_end_a_run(storm, role):
 @pytest.mark.parametrize(("visible", "names"), [("", ["0", "1"]), ("4,GPU-7", ["4", "GPU-7"])])
 def test_each_rank_sees_one_of_the_visible_gpus(monkeypatch, visible, names):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-    assert [processes.gpu_of_rank(rank) for rank in range(2)] == names
+    assert [accelerators.gpu_of_rank(rank) for rank in range(2)] == names
