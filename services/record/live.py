@@ -24,6 +24,10 @@ _TOPICS = 4096
 """Open channels; beyond this the one that was silent for longest is closed."""
 _LATCHED_BYTES = 64 << 20
 """Bytes of latched messages kept for late subscribers."""
+_BURST_BYTES = 256 << 10
+"""Bytes that are sent before the gate must have read them (`LiveGate.wait_until_read`)."""
+_READ_TIMEOUT_S = 1.0
+"""Longest wait for the gate; then the entry is dropped."""
 
 
 class LiveServer(Closing):
@@ -51,6 +55,7 @@ class LiveServer(Closing):
         self._topics: collections.OrderedDict[str, tuple[Channel, Any]] = collections.OrderedDict()
         self._last: collections.OrderedDict[str, Entry] = collections.OrderedDict()
         self._latched_bytes = 0
+        self._burst_bytes = 0
         self.queued_bytes = 0
         """Bytes of the entries that wait for their time."""
         self._accounting = threading.Lock()  # guards `queued_bytes` and `left_out`
@@ -130,8 +135,12 @@ class LiveServer(Closing):
             heapq.heappush(self._waiting, (entry.time, next(self._number), entry))
             return
         self._release(entry)
+        self._count_left_out(entry.channel.topic)
+
+    def _count_left_out(self, topic: str) -> None:
+        """Counts a dropped entry."""
         with self._accounting:
-            self.left_out[entry.channel.topic] += 1
+            self.left_out[topic] += 1
 
     def _release(self, entry: Entry) -> None:
         """Removes an entry from the accounting of the queue."""
@@ -139,8 +148,14 @@ class LiveServer(Closing):
             self.queued_bytes -= len(entry.data)
 
     def _send(self, entry: Entry) -> None:
-        """Sends an entry on its channel."""
+        """Sends an entry on its channel, or drops it if the gate is behind."""
         topic = entry.channel.topic
+        if self._burst_bytes > _BURST_BYTES:
+            if not self._gate.wait_until_read(_READ_TIMEOUT_S):
+                self._count_left_out(topic)
+                return
+            self._burst_bytes = 0
+        self._burst_bytes += len(entry.data)
         channel, _ = self._topics.get(topic, (None, None))
         if channel != entry.channel:
             self._advertise(entry.channel)

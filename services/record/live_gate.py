@@ -5,11 +5,15 @@ connections on to the server of the SDK, which would answer any site that a brow
 import asyncio
 import contextlib
 import re
+import selectors
 import socket
 import threading
+import time
 import urllib.parse
+from asyncio.trsock import TransportSocket
 
 from congrasp.common.transport.places import Places
+from congrasp.services.ops.logs import log
 
 LOCAL_HOST = "127.0.0.1"
 _LOOPBACK = (LOCAL_HOST, "localhost", "::1")
@@ -21,17 +25,24 @@ _HEAD_S = 10.0
 """Time in which the head must arrive."""
 _SOCKETS = 32
 """Connections at a time, shared by addresses."""
-_UNREAD_BYTES = 4 << 20
-"""Bytes that wait for a client that does not read."""
-UNREAD_S = 10.0
-"""Time after which a client that does not read is dropped."""
+UNREAD_BYTES = 64 << 20
+"""Bytes that wait for all viewers together; beyond this the one with the most is dropped."""
+_REPORT_INTERVAL_S = 60.0
+"""Least time between two log lines on dropped viewers."""
 _CHUNK_BYTES = 1 << 16
+_POLL_S = 0.001
+"""Time between two checks for unread bytes."""
+_REQUEST_S = 10.0
+"""Time in which the server of the SDK must read what a viewer sends."""
 _CLOSING_S = 1.0
 
 
 class LiveGate:
     """Passes connections on to the server of the SDK, which answers any site that a browser
     shows.
+
+    It always reads what that server sends, since the server's queue for a viewer is limited by
+    number but not by bytes. The bytes that viewers have not read wait here (`UNREAD_BYTES`).
     """
 
     def __init__(self, outside: socket.socket, inside: tuple[str, int]):
@@ -39,6 +50,10 @@ class LiveGate:
         self._outside = outside
         self._inside = inside
         self._places = Places(_SOCKETS)
+        self._viewers: dict[asyncio.WriteTransport, TransportSocket] = {}
+        """Socket on which the server of the SDK sends, by connection of a viewer."""
+        self._dropped = 0
+        self._next_report_time = 0.0
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run, daemon=True, name="live gate")
         self._thread.start()
@@ -48,6 +63,36 @@ class LiveGate:
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(_CLOSING_S)
         self._outside.close()
+
+    def wait_until_read(self, timeout: float) -> bool:
+        """Waits until the gate has read what the server of the SDK has sent.
+
+        Args:
+          timeout: longest wait, s.
+
+        Returns:
+          False after the timeout.
+        """
+        reading = asyncio.run_coroutine_threadsafe(self._read_all(), self._loop)
+        try:
+            reading.result(timeout)
+        except TimeoutError:
+            reading.cancel()
+            return False
+        return True
+
+    async def _read_all(self) -> None:
+        """Returns when no bytes of the server of the SDK wait for the gate."""
+        while self._has_unread():
+            await asyncio.sleep(_POLL_S)
+
+    def _has_unread(self) -> bool:
+        """True if bytes of the server of the SDK wait for the gate."""
+        with selectors.DefaultSelector() as selector:
+            for to_socket in self._viewers.values():
+                if to_socket.fileno() >= 0:
+                    selector.register(to_socket, selectors.EVENT_READ)
+            return bool(selector.select(0))
 
     def _run(self) -> None:
         """Runs until it is closed."""
@@ -92,7 +137,64 @@ class LiveGate:
             to_reader, to_writer = await asyncio.open_connection(*self._inside)
             with contextlib.closing(to_writer):
                 to_writer.write(head)
-                await _relay(reader, writer, to_reader, to_writer)
+                self._viewers[writer.transport] = to_writer.get_extra_info("socket")
+                try:
+                    await self._relay(reader, writer, to_reader, to_writer)
+                finally:
+                    del self._viewers[writer.transport]
+
+    async def _relay(
+        self,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+        to_reader: asyncio.StreamReader,
+        to_writer: asyncio.StreamWriter,
+    ) -> None:
+        """Copies both directions of a connection until one ends; then both are dropped at once."""
+        directions = (
+            asyncio.ensure_future(_copy_requests(reader, to_writer)),
+            asyncio.ensure_future(self._copy_messages(to_reader, writer)),
+        )
+        try:
+            await asyncio.wait(directions, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for direction in directions:
+                direction.cancel()
+            await asyncio.gather(*directions, return_exceptions=True)
+            for receiver in (writer, to_writer):
+                if receiver.transport.get_write_buffer_size():
+                    receiver.transport.abort()
+
+    async def _copy_messages(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
+        """Copies messages to a viewer until the connection ends."""
+        while data := await reader.read(_CHUNK_BYTES):
+            writer.write(data)
+            self._limit_unread()
+            if writer.transport.is_closing():
+                return
+
+    def _limit_unread(self) -> None:
+        """Drops viewers until the unread bytes of the others are within the limit."""
+        unread = {viewer: viewer.get_write_buffer_size() for viewer in self._viewers}
+        while sum(unread.values()) > UNREAD_BYTES:
+            slowest = max(unread, key=lambda viewer: unread[viewer])
+            slowest.abort()
+            del unread[slowest]
+            self._report_dropped()
+
+    def _report_dropped(self) -> None:
+        """Counts a dropped viewer, and logs their number now and then."""
+        self._dropped += 1
+        now = time.monotonic()
+        if now < self._next_report_time:
+            return
+        self._next_report_time = now + _REPORT_INTERVAL_S
+        log(
+            "warning",
+            f"The live view has dropped {self._dropped} viewer(s) that did not read fast enough.",
+        )
 
 
 def _answer(writer: asyncio.StreamWriter, status: str, text: str) -> None:
@@ -102,34 +204,11 @@ def _answer(writer: asyncio.StreamWriter, status: str, text: str) -> None:
     writer.write(head.encode() + body)
 
 
-async def _relay(
-    reader: asyncio.StreamReader,
-    writer: asyncio.StreamWriter,
-    to_reader: asyncio.StreamReader,
-    to_writer: asyncio.StreamWriter,
-) -> None:
-    """Copies both directions of a connection until one ends; then both are dropped at once."""
-    writer.transport.set_write_buffer_limits(high=_UNREAD_BYTES)
-    directions = (
-        asyncio.ensure_future(_pump(reader, to_writer)),
-        asyncio.ensure_future(_pump(to_reader, writer)),
-    )
-    try:
-        await asyncio.wait(directions, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        for direction in directions:
-            direction.cancel()
-        await asyncio.gather(*directions, return_exceptions=True)
-        for receiver in (writer, to_writer):
-            if receiver.transport.get_write_buffer_size():
-                receiver.transport.abort()
-
-
-async def _pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    """Copies one direction of a connection until it ends, or its receiver does not read."""
+async def _copy_requests(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    """Copies what a viewer sends until the connection ends."""
     while data := await reader.read(_CHUNK_BYTES):
         writer.write(data)
-        await asyncio.wait_for(writer.drain(), UNREAD_S)
+        await asyncio.wait_for(writer.drain(), _REQUEST_S)
 
 
 def _fault(head: str) -> str:

@@ -8,7 +8,9 @@ import pathlib
 import socket
 import struct
 import time
+from collections.abc import Sequence
 
+import psutil
 import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
@@ -19,7 +21,7 @@ from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message
 from congrasp.services.record.live import LiveServer
 from congrasp.services.record.recorder import Recorder
-from congrasp.services.record.writer import JsonChannels
+from congrasp.services.record.writer import Entry, JsonChannels
 from tests.episodes import CONTROL_DT, episode_message
 
 MESSAGE_DATA = 1  # operation code of a binary frame with a message
@@ -77,6 +79,7 @@ def viewer(server: LiveServer, max_queue: int = 16) -> ClientConnection:
         subprotocols=["foxglove.sdk.v1"],
         max_size=1 << 24,
         max_queue=max_queue,
+        close_timeout=0.1,
     )
 
 
@@ -226,24 +229,53 @@ def test_viewer_of_another_address_is_admitted_when_full() -> None:
         assert crowd[0].recv(1 << 12).startswith(b"HTTP/1.1 101 ")
 
 
+def number_entry(channels: JsonChannels, number: int, size: int) -> Entry:
+    """Entry of the topic `/m` with a number and `size` further bytes, due now."""
+    fields = {"number": number, "text": "x" * size}
+    return channels.entry("/m", time.time_ns(), fields)
+
+
+def subscribe_all(server: LiveServer, channels: JsonChannels, viewers: Sequence[Viewer]) -> None:
+    """Sends small entries until each viewer has received one."""
+    while not all(viewer.frames["/m"] for viewer in viewers):
+        server.write(number_entry(channels, -1, 0))
+        for viewer in viewers:
+            viewer.listen(0.05)
+
+
 def test_viewer_that_does_not_read_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What waits for it is limited, and another viewer misses nothing."""
-    monkeypatch.setattr("congrasp.services.record.live_gate.UNREAD_S", 1.0)
+    """Another viewer misses nothing."""
+    monkeypatch.setattr("congrasp.services.record.live_gate.UNREAD_BYTES", 8 << 20)
     entries = 48
-    text = "x" * (1 << 20)
     channels = JsonChannels()
     with LiveServer(0) as server, viewer(server) as reading, viewer(server, 1) as stuck:
         seen = Viewer(reading)
         unread = Viewer(stuck)
-        while not (seen.frames["/m"] and unread.frames["/m"]):  # until both have subscribed
-            server.write(channels.entry("/m", time.time_ns(), {"number": -1, "text": ""}))
-            seen.listen(0.05)
-            unread.listen(0.05)
+        subscribe_all(server, channels, [seen, unread])
         for number in range(entries):
-            server.write(channels.entry("/m", time.time_ns(), {"number": number, "text": text}))
+            server.write(number_entry(channels, number, 1 << 20))
             while seen.latest("/m") < number:
                 seen.listen(0.05)
+        numbers = [json.loads(data)["number"] for _, data in seen.frames["/m"]]
+        assert numbers[-entries:] == list(range(entries))
         with pytest.raises(ConnectionClosed):
             while unread.latest("/m") < entries - 1:
-                time.sleep(2.0)
-                unread.listen(0.1)
+                unread.listen(1.0)
+
+
+def test_memory_of_unread_messages_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Six viewers do not read 100 MB each, of which at most a fifth of all is held."""
+    monkeypatch.setattr("congrasp.services.record.live_gate.UNREAD_BYTES", 16 << 20)
+    process = psutil.Process()
+    channels = JsonChannels()
+    with LiveServer(0) as server, contextlib.ExitStack() as stack:
+        viewers = [Viewer(stack.enter_context(viewer(server, 1))) for _ in range(6)]
+        subscribe_all(server, channels, viewers)
+        before = process.memory_info().rss
+        most = before
+        for number in range(100):
+            server.write(number_entry(channels, number, 1 << 20))
+            while server.queued_bytes:
+                time.sleep(0.001)
+            most = max(most, process.memory_info().rss)
+    assert most - before < 120e6
