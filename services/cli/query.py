@@ -85,7 +85,7 @@ class Query:
         from congrasp.services.serve.load import example_episode
 
         with self._client() as client:
-            hand = str(client.health()["hand"])
+            hand = str(client.wait_until_ready()["hand"])
             return example_episode(self.object_seed, hand)
 
     def _print_latency(self, episode: "Example") -> int:

@@ -58,6 +58,22 @@ class PolicyClient(EpisodePolicy):
             self._transport.query(self._keys.health, Message({}, {}), timeout=self._timeout).meta
         )
 
+    def wait_until_ready(self) -> dict[str, Any]:
+        """Health of the server; waits for one that is starting.
+
+        Raises:
+          StartingError: it is still starting after the seconds to wait.
+          TransportError: there is no response.
+        """
+        return self._patiently(self._ready_health)
+
+    def _ready_health(self) -> dict[str, Any]:
+        """The health of a server that answers queries."""
+        health = self.health()
+        if not health["ready"]:
+            raise StartingError(f"The policy server is {health['state']}.", "Wait for it.")
+        return health
+
     def metadata(self) -> dict[str, Any]:
         """See `Policy.metadata`; waits for a server that is starting."""
         forks.require_same_process(self._opened, "policy")

@@ -15,6 +15,7 @@ from congrasp.common.errors import (
     CongraspError,
     OverloadedError,
     RefusedError,
+    StartingError,
     TransportError,
 )
 from congrasp.common.policy import bundle as bundles
@@ -23,6 +24,7 @@ from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message
+from congrasp.services.cli.query import Query
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.ops.metrics import ServerMetrics, serve_metrics
 from congrasp.services.serve.inference import Inference, PolicyFunction
@@ -386,6 +388,46 @@ def test_queries_to_a_compiling_server_are_refused_and_counted(monkeypatch):
         done.set()
         starting.result(60).close()
     assert outcomes == ["refused"]
+
+
+def test_query_command_waits_for_compilation(monkeypatch, capsys):
+    asked = threading.Event()
+    done = threading.Event()
+    health = PolicyServer.health
+
+    def warm_up(function, weights):
+        assert done.wait(60)
+        return {1: 0.01}
+
+    def noted_health(server):
+        asked.set()
+        return health(server)
+
+    monkeypatch.setattr(PolicyFunction, "warm_up", warm_up)
+    monkeypatch.setattr(PolicyServer, "health", noted_health)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with (
+        ZenohTransport(listen=[endpoint], flows=("policy",)) as transport,
+        concurrent.futures.ThreadPoolExecutor(2) as pool,
+    ):
+        starting = pool.submit(
+            PolicyServer,
+            transport,
+            "policy",
+            lambda version: task.policy() if version < 0 else None,
+        )
+        with (
+            PolicyClient(endpoint, wait=1.0) as client,
+            pytest.raises(StartingError, match="compiling"),
+        ):
+            client.wait_until_ready()
+        asked.clear()
+        querying = pool.submit(Query(endpoint, timeout=60.0))
+        assert asked.wait(60)
+        done.set()
+        assert querying.result(120) == 0
+        starting.result(60).close()
+    assert "q_target" in capsys.readouterr().out
 
 
 def test_a_failed_start_leaves_no_thread(quick_start, monkeypatch):
