@@ -109,6 +109,11 @@ class _Account(Generic[T]):
         """Number of peers with an item that have not had a turn."""
         return sum(map(self.turns.is_newcomer, self._entries))
 
+    @property
+    def peers_with_single_item(self) -> int:
+        """Number of peers with exactly one item, which may wait for its answer."""
+        return sum(len(entries) == 1 for entries in self._entries.values())
+
     def items(self) -> Iterator[T]:
         """Yields all items, those of one peer together."""
         for entries in self._entries.values():
@@ -219,15 +224,17 @@ class FairQueue(Generic[T]):
     @property
     def peers_ahead(self) -> int:
         """Number of peers whose turn comes before those with a backlog: all peers of accounts that
-        have not had a turn, else the peers that have not had one, else all.
+        have not had a turn, else the peers that have not had one, else those with a single item.
         """
         of_new_accounts = 0
         newcomers = 0
+        with_single_item = 0
         for name, account in self._accounts.items():
             newcomers += account.newcomers
+            with_single_item += account.peers_with_single_item
             if self._turns.is_newcomer(name):
                 of_new_accounts += account.peers
-        return of_new_accounts or newcomers or self.peers
+        return of_new_accounts or newcomers or with_single_item
 
     def peers_of(self, account: str) -> int:
         """Number of peers of an account with an item."""

@@ -57,9 +57,9 @@ class Arrivals:
             with self._lock:
                 excess = self._receive()
                 arrival = self._pop()
+            yield arrival
             for query in excess:
                 self._refuse(query)
-            yield arrival
 
     def _receive(self) -> list[Any]:
         """Moves all queries of the channel to the queue, which then has at least one.

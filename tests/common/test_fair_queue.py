@@ -118,6 +118,18 @@ def test_newcomer_precedes_backlogs(queued, newcomer):
 
 
 @pytest.mark.parametrize(
+    ("queued", "peers_ahead"),
+    [("a1 a1 a1 b1 b1 b1", 0), ("a1 a1 a1 b1 b1", 1), ("a1 a1 b1 b1", 2)],
+)
+def test_backlogs_are_not_ahead(queued, peers_ahead):
+    """After their first turns, only peers with a single item are."""
+    queue = filled(20, 20, queued)
+    for _ in range(2):
+        take(queue)
+    assert queue.peers_ahead == peers_ahead
+
+
+@pytest.mark.parametrize(
     ("queued", "returning"),
     [("a1 a1 a1 b1 b1 b1", "c1"), ("a1 a1 a1 a2 a2 a2", "a3")],
 )

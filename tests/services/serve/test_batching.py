@@ -92,6 +92,10 @@ def several(monkeypatch):
 class Letters(Gate):
     """Items are texts, whose letters are what they weigh, and are run one by one."""
 
+    def __init__(self, limits=(4,)):
+        super().__init__()
+        self._limits = limits
+
     def __call__(self, items, queued):
         self.entered.release()
         assert self.go.wait(10)
@@ -103,9 +107,9 @@ class Letters(Gate):
 
     def batcher(self):
         splitting = Splitting(
-            (4,), lambda item, first, end: item[first:end], self.join, self.run_again
+            self._limits, lambda item, first, end: item[first:end], self.join, self.run_again
         )
-        return Batcher(self, size=8, window=0.0, depth=10, weigh=len, splitting=splitting)
+        return Batcher(self, size=8, window=0.0, depth=20, weigh=len, splitting=splitting)
 
     def run(self, *items, timeout=10.0):
         """Submits (peer, item) while the first is held back; their futures."""
@@ -140,6 +144,16 @@ def test_peers_share_a_batch_however_long_their_items_are(several, items, batche
     futures, batcher = gate.run(*queries)
     assert [future.result(10) for future in futures] == [item.upper() for _, item in queries]
     assert gate.batches == batches
+    batcher.close()
+
+
+def test_batches_of_backlogs_are_small(several):
+    """A newcomer waits for the end of a small batch, unless peers with a single item fill it."""
+    gate = Letters(limits=(2, 8))
+    backlogs = [(peer, "x") for peer in 5 * "bcd"]
+    futures, batcher = gate.run(("a", "k"), *backlogs)
+    assert [future.result(10) for future in futures] == ["K", *15 * "X"]
+    assert [len(batch) for batch in gate.batches] == [1, 6, 2, 2, 2, 3]
     batcher.close()
 
 
