@@ -9,13 +9,16 @@ import numpy as np
 from congrasp.common.errors import LayoutError, RefusedError
 from congrasp.common.request import GraspRequest
 from congrasp.common.runtime import forks
-from congrasp.common.runtime.settings import library_settings
 from congrasp.common.task.resting import resting_mean
 from congrasp.common.wire.codec import Message
 from congrasp.services.client.fields import RESTING_POSE, episode_fields, numbers
 from congrasp.services.client.packer import HISTORY_FIELDS, PACKED, Packer
 from congrasp.services.client.policy import Answer, Policy, State
 
+_NUMPY_SETTINGS = np.errstate(all="ignore")
+"""The library's settings of NumPy. Making a query needs no JAX; entering JAX's settings would take
+as long as making the query.
+"""
 _OBJECT_POSE = ("object_position", "object_quaternion")
 _MAX_HISTORY = 64  # largest history of a policy, control steps
 
@@ -53,13 +56,13 @@ class EpisodePolicy(Policy):
         """
         raise NotImplementedError
 
-    @library_settings()
+    @_NUMPY_SETTINGS
     def metadata(self) -> dict[str, Any]:
         """See `Policy.metadata`."""
         forks.require_same_process(self._opened, "policy")
         return self._described()
 
-    @library_settings()
+    @_NUMPY_SETTINGS
     def reset(self, request: GraspRequest) -> None:
         """See `Policy.reset`."""
         forks.require_same_process(self._opened, "policy")
@@ -70,7 +73,7 @@ class EpisodePolicy(Policy):
         self._rested = np.asarray(1)
         self._past = []
 
-    @library_settings()
+    @_NUMPY_SETTINGS
     def act(self, state: State) -> Answer:
         """See `Policy.act`."""
         forks.require_same_process(self._opened, "policy")
@@ -88,7 +91,7 @@ class EpisodePolicy(Policy):
         self._rested = rested
         return answer
 
-    @library_settings()
+    @_NUMPY_SETTINGS
     def act_each(self, states: Sequence[State]) -> list[Answer]:
         """See `Policy.act_each`."""
         forks.require_same_process(self._opened, "policy")

@@ -21,6 +21,7 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import InferenceParameters, PolicyBundle, mean_action
 from congrasp.common.policy.pretrained import named_policy
 from congrasp.common.runtime.entry import compiling_entry
+from congrasp.common.runtime.settings import library_settings
 from congrasp.common.task import control, observation
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints.priority import explain, resolve
@@ -241,10 +242,12 @@ class LocalPolicy(EpisodePolicy):
         self._function = PolicyFunction(get_hand(bundle.spec.hand), bundle.task)
         self._function.warm_up(bundle.inference_parameters, BATCH_SIZES[:1])
 
+    @library_settings()
     def _described(self) -> dict[str, Any]:
         """The metadata of the bundle."""
         return self._function.metadata()
 
+    @library_settings()
     def _query(self, query: Message) -> Message:
         """Returns the reply of a server with this bundle."""
         began = time.perf_counter()

@@ -15,6 +15,7 @@ NAMES = (
         "sensors",
         "attacks",
         "crowding",
+        "stages",
         "transport",
         "faults",
         "replacements",
