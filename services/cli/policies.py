@@ -138,6 +138,7 @@ class Average:
 
     Examples:
       congrasp policies average runs/mine/policy.safetensors human --weights 0.5 0.5
+      congrasp policies average new.safetensors old.safetensors --weights 0.7 0.3
     """
 
     policies: Annotated[tuple[str, ...], tyro.conf.Positional]

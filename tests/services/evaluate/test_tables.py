@@ -216,7 +216,7 @@ def test_all_levels_have_the_same_episodes(experiment, monkeypatch):
             seen.append((jax.device_get(begun), [obj.mass for obj in self.objects]))
             return mock.Mock()
 
-    monkeypatch.setattr(Experiment, "simulator", lambda self, task, traced: Running())
+    monkeypatch.setattr(Experiment, "simulator", lambda self, task, **options: Running())
     monkeypatch.setattr(
         Experiment,
         "row",
