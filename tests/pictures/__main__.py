@@ -72,6 +72,8 @@ def _draw(picture: Picture, places: dict[str, str], folder: pathlib.Path) -> str
             _run(picture.command, places, folder)
         except subprocess.CalledProcessError as error:
             return f"'{shlex.join(error.cmd)}' failed with {error.returncode}"
+        if not (folder / picture.output).is_file():
+            return f"its command wrote no {picture.output}"
         shutil.copyfile(folder / picture.output, target)
     origin = provenance.current(picture.command, picture.policies, rendered=picture.rendered)
     provenance.write(target, origin)
