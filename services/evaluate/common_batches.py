@@ -4,6 +4,7 @@ An engine on a device needs nearly as long for a few hundred worlds as for thous
 not depend on the others of their batch, so a row has the same episodes as in batches of its own.
 """
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
 
 import jax
@@ -37,11 +38,7 @@ def run_rows(
     samples: list[list[Sample]] = [[] for _ in rows]
     finished = 0
     for conditions, count in _batches(rows, simulator.batch):
-
-        def report(share: float, finished: int = finished, count: int = count) -> None:
-            """Counts the episodes of the running batch by their share of control steps."""
-            progress(finished + int(share * count))
-
+        report = functools.partial(report_share, progress, finished, count)
         batch = simulator.run(conditions, stressed=stressed, progress=report)
         row_in_batch = np.full(simulator.batch, -1)
         row_in_batch[:count] = row_of_episode[finished : finished + count]
@@ -50,6 +47,13 @@ def run_rows(
         finished += count
         progress(finished)
     return [join_samples(of_row) for of_row in samples]
+
+
+def report_share(progress: Callable[[int], None], finished: int, count: int, share: float) -> None:
+    """Counts the `count` episodes of a running batch by their share of control steps, in addition
+    to those that are finished.
+    """
+    progress(finished + int(share * count))
 
 
 def _batches(

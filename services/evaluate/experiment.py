@@ -36,7 +36,7 @@ from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.sampling.build import build_bank, with_columns
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.evaluate import references
-from congrasp.services.evaluate.common_batches import run_rows
+from congrasp.services.evaluate.common_batches import report_share, run_rows
 from congrasp.services.evaluate.episodes import Batch, Episodes, Sample, join_samples
 from congrasp.services.evaluate.plan import (
     NOMINAL_FRICTION,
@@ -523,11 +523,7 @@ class Experiment:
         to_stress = min(plan.total, stressed) if running.stressable else 0
         finished = 0
         for planned, count in batches(self.hand, task, bank, plan, self.seed, running.batch):
-
-            def report(share: float, finished: int = finished, count: int = count) -> None:
-                """Counts the episodes of the running batch by their share of control steps."""
-                progress(finished + int(share * count))
-
+            report = functools.partial(report_share, progress, finished, count)
             conditions = variation.episodes(planned, task.control_dt)
             stresses = finished < to_stress
             batch = running.run(conditions, stressed=stresses, progress=report)

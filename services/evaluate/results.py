@@ -35,6 +35,8 @@ from congrasp.services.evaluate.scores import Row
 from congrasp.services.evaluate.text_table import Columns, Table, percent
 
 _BLOCK = re.compile(r"(<!-- results (\S+) (\S+) -->\n).*?(<!-- end of results -->)", re.S)
+_ENGINES = "engines"
+"""Kind of the table of several files (`engine_table`)."""
 
 
 def provenance(accelerators: str = "") -> dict[str, Any]:
@@ -132,8 +134,6 @@ KINDS: dict[str, Callable[[Results], list[str]]] = {
     function.__name__: function for function in (summary, rates, plausibility, conditions, headings)
 }
 """Tables of a file of results available to pages, as lines of Markdown."""
-_ENGINES = "engines"
-"""Kind of the table of several files (`engine_table`)."""
 
 
 def _table(kind: str, results: Mapping[str, Results], name: str) -> list[str]:

@@ -76,12 +76,17 @@ def test_a_recorder_keeps_its_size(tmp_path):
     assert sum(path.stat().st_size for path in tmp_path.iterdir()) < 30 << 20
 
 
+def admit_64_names(budget):
+    """Admits as many names of one identity as it may have."""
+    for i in range(64):
+        budget.admit(Publisher("actor", f"1.{i}"))
+
+
 def test_names_of_one_identity_are_limited_until_they_have_been_silent():
     clock = Clock()
     forgotten = []
     budget = LogBudget(forgotten.append, clock)
-    for i in range(64):
-        budget.admit(Publisher("actor", f"1.{i}"))
+    admit_64_names(budget)
     with pytest.raises(CongraspError, match="More than 64 names of one certificate"):
         budget.admit(Publisher("actor", "1.new"))
     budget.admit(Publisher("actor", "0.a"))
@@ -110,8 +115,7 @@ def test_a_message_beyond_the_bytes_replaces_no_name():
     clock = Clock()
     forgotten = []
     budget = LogBudget(forgotten.append, clock)
-    for i in range(64):
-        budget.admit(Publisher("actor", f"1.{i}"))
+    admit_64_names(budget)
     clock.now = 61.0
     budget.charge(Publisher("actor", "1.0"), 300 << 20)
     with pytest.raises(CongraspError, match="MiB"):
