@@ -123,6 +123,16 @@ class Result(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class _PlannedRow:
+    """A row before it is simulated."""
+
+    variation: Variation
+    plan: RowPlan
+    file: pathlib.Path | None
+    """File of its episodes; None to keep none."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Experiment:
     """Episodes of one policy on some objects."""
 
@@ -321,73 +331,79 @@ class Experiment:
         Raises:
           CongraspError: no object allows a row's constraints, or the policy does not support them.
         """
-        plans = [self.plan(variation) for variation in variations]
-        advance = self.track("Episodes", sum(plan.total for plan in plans))
-        row_files: list[pathlib.Path | None] = [None] * len(variations)
-        if stored is not None:
-            row_files = [
-                stored / f"{self._name(variation)}.safetensors" for variation in variations
-            ]
-        results: list[Result | None] = []
-        for variation, file in zip(variations, row_files, strict=True):
-            results.append(self._stored_result(variation, file))
-        missing = [n for n, result in enumerate(results) if result is None]
-        for task, group in itertools.groupby(missing, lambda n: variations[n].task(self.task)):
-            rows = list(group)
-            together = ENGINES[self.physics].on_device and not keep
-            worlds = self.worlds
-            if together:
-                worlds = self.worlds_for(sum(plans[n].total for n in rows))
-            with self.simulator(task, worlds=worlds, traced=keep) as running:
-                for of_run in self._runs(variations, rows, together):
-                    finished = sum(result.row.episodes for result in results if result)
-                    progress = functools.partial(advance_from, advance, finished)
-                    run_variations = [variations[n] for n in of_run]
-                    run_plans = [plans[n] for n in of_run]
-                    if together:
-                        done = self._run_together(running, run_variations, run_plans, progress)
-                    else:
-                        done = [self._run(running, run_variations[0], run_plans[0], progress, keep)]
-                    for n, result in zip(of_run, done, strict=True):
-                        results[n] = result
-                        file = row_files[n]
-                        if file is not None:
-                            files.keep(file, Message(result.sample.arrays()), len(row_files))
-        return [result for result in results if result is not None]
+        rows = []
+        for variation in variations:
+            file = None if stored is None else stored / f"{self._name(variation)}.safetensors"
+            rows.append(_PlannedRow(variation, self.plan(variation), file))
+        advance = self.track("Episodes", sum(row.plan.total for row in rows))
+        results: dict[_PlannedRow, Result] = {}
+        for row in rows:
+            stored_result = self._stored_result(row)
+            if stored_result is not None:
+                results[row] = stored_result
+        missing = [row for row in rows if row not in results]
+        for task, of_task in itertools.groupby(missing, lambda row: row.variation.task(self.task)):
+            finished = sum(result.row.episodes for result in results.values())
+            progress = functools.partial(advance_from, advance, finished)
+            for row, result in self._simulate(task, list(of_task), keep, progress):
+                results[row] = result
+                if row.file is not None:
+                    files.keep(row.file, Message(result.sample.arrays()), len(rows))
+        return [results[row] for row in rows]
 
-    def _runs(
-        self, variations: Sequence[Variation], rows: Sequence[int], together: bool
-    ) -> Iterator[list[int]]:
-        """Yields the rows of each run of a simulator: neighbours that share their objects if rows
-        run together, else one.
+    def _simulate(
+        self,
+        task: TaskConfig,
+        rows: Sequence[_PlannedRow],
+        keep: bool,
+        progress: Callable[[int], None],
+    ) -> Iterator[tuple[_PlannedRow, Result]]:
+        """Simulates rows of one task with one simulator; yields each row with its result.
+
+        On a device, neighbours that share their objects run in common batches, unless episodes are
+        kept.
         """
-        if not together:
-            for n in rows:
-                yield [n]
+        finished = 0
+        if keep or not ENGINES[self.physics].on_device:
+            with self.simulator(task, traced=keep) as running:
+                for row in rows:
+                    progress_of_row = functools.partial(advance_from, progress, finished)
+                    yield row, self._run(running, row, progress_of_row, keep)
+                    finished += row.plan.total
             return
-        objects = {n: variations[n].objects(self.scaled) for n in rows}
-        for _, group in itertools.groupby(rows, lambda n: id(objects[n])):
-            yield list(group)
+        worlds = self.worlds_for(sum(row.plan.total for row in rows))
+        with self.simulator(task, worlds=worlds) as running:
+            for objects, neighbours in self._by_objects(rows):
+                self._use_objects(running, objects)
+                progress_of_run = functools.partial(advance_from, progress, finished)
+                results = self._run_together(running, neighbours, progress_of_run)
+                yield from zip(neighbours, results, strict=True)
+                finished += sum(row.plan.total for row in neighbours)
+
+    def _by_objects(
+        self, rows: Sequence[_PlannedRow]
+    ) -> Iterator[tuple[Sequence[GraspObject], list[_PlannedRow]]]:
+        """Yields neighbouring rows that share their objects, and these."""
+        objects = [row.variation.objects(self.scaled) for row in rows]
+        pairs = zip(objects, rows, strict=True)
+        for _, group in itertools.groupby(pairs, lambda pair: id(pair[0])):
+            of_group = list(group)
+            yield of_group[0][0], [row for _, row in of_group]
 
     def _run_together(
         self,
         running: Episodes,
-        variations: Sequence[Variation],
-        plans: Sequence[RowPlan],
+        rows: Sequence[_PlannedRow],
         progress: Callable[[int], None],
     ) -> list[Result]:
-        """Simulates rows of one task and the same objects in common batches; all their episodes
+        """Simulates rows of the simulator's task and objects in common batches; all their episodes
         continue after the hold.
         """
-        self._use_objects(running, variations[0].objects(self.scaled))
-        rows = [
-            self._conditions(variation, plan)
-            for variation, plan in zip(variations, plans, strict=True)
-        ]
-        samples = run_rows(running, rows, stressed=running.stressable, progress=progress)
+        conditions = [self._conditions(row.variation, row.plan) for row in rows]
+        samples = run_rows(running, conditions, stressed=running.stressable, progress=progress)
         results = []
-        for variation, sample in zip(variations, samples, strict=True):
-            results.append(Result(variation, sample, self.row(variation, sample), [], []))
+        for row, sample in zip(rows, samples, strict=True):
+            results.append(Result(row.variation, sample, self.row(row.variation, sample), [], []))
         return results
 
     def _conditions(self, variation: Variation, plan: RowPlan) -> InitialConditions:
@@ -409,13 +425,13 @@ class Experiment:
         if objects is not running.objects:
             running.replace_objects(objects, self.field)
 
-    def _stored_result(self, variation: Variation, file: pathlib.Path | None) -> Result | None:
+    def _stored_result(self, row: _PlannedRow) -> Result | None:
         """Returns the result of a row from its file, without kept episodes; None without one."""
-        message = None if file is None else files.read_kept(file)
+        message = None if row.file is None else files.read_kept(row.file)
         if message is None:
             return None
         sample = Sample.of(message.arrays)
-        return Result(variation, sample, self.row(variation, sample), [], [])
+        return Result(row.variation, sample, self.row(row.variation, sample), [], [])
 
     def _name(self, variation: Variation) -> str:
         """File name of a row, from everything that it depends on."""
@@ -449,8 +465,7 @@ class Experiment:
     def _run(
         self,
         running: Episodes,
-        variation: Variation,
-        plan: RowPlan,
+        row: _PlannedRow,
         progress: Callable[[int], None],
         keep: bool,
     ) -> Result:
@@ -466,8 +481,8 @@ class Experiment:
                     episodes.append(batch.episode(i))
 
         visit = keep_some if keep else _ignore
-        sample = self.sample(running, variation, plan, progress, visit)
-        return Result(variation, sample, self.row(variation, sample), held, lost)
+        sample = self.sample(running, row.variation, row.plan, progress, visit)
+        return Result(row.variation, sample, self.row(row.variation, sample), held, lost)
 
     def sample(
         self,
