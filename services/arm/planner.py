@@ -97,6 +97,23 @@ class ArmPlanner:
         """Side of the object on which the base is, rad from the x axis of the world frame."""
         return float(np.arctan2(self._base.position[1], self._base.position[0]))
 
+    def require_reach(self, obj: GraspObject) -> None:
+        """Refuses a base from which the stretched arm cannot touch the object on the table.
+
+        Raises:
+          CongraspError: the object is farther away than arm and hand are long.
+        """
+        reach = self._robot_with(obj).reach
+        radius = float(np.linalg.norm(obj.points, axis=1).max())
+        distance = float(np.linalg.norm(self._base.position))
+        nearest = distance - 2.0 * radius  # the object's origin is at most its radius high
+        if nearest > reach:
+            raise CongraspError(
+                f"{self.name}'s base is {distance:.2f} m away from '{obj.name}', and arm and hand "
+                f"are at most {reach:.2f} m long.",
+                "Set another --base.",
+            )
+
     def plan(self, obj: GraspObject, motion: Episode) -> ArmMotion:
         """Computes the joints along a motion.
 

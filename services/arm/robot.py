@@ -111,6 +111,27 @@ class Robot:
                 links.append(body)
         return links
 
+    @property
+    def reach(self) -> float:
+        """Upper bound on the distance of a point of arm and hand from the base, m: the offsets of
+        the bodies and joints, added up as if all of them were stretched out in one line.
+        """
+        model = self.model
+        lengths = np.linalg.norm(model.body_pos, axis=1)
+        for joint in range(model.njnt):
+            body = model.jnt_bodyid[joint]
+            lengths[body] += 2.0 * np.linalg.norm(model.jnt_pos[joint])
+            if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
+                limits = model.jnt_range[joint] if model.jnt_limited[joint] else np.inf
+                lengths[body] += np.abs(limits).max()
+        farthest = np.zeros(model.nbody)
+        for body in range(1, model.nbody):
+            if model.body(body).name not in _SCENE:
+                farthest[body] = farthest[model.body_parentid[body]] + lengths[body]
+        extents = np.linalg.norm(model.geom_pos, axis=1) + model.geom_rbound
+        of_robot = [model.body(body).name not in _SCENE for body in model.geom_bodyid]
+        return float((farthest[model.geom_bodyid] + extents)[of_robot].max())
+
 
 def default_mount(hand: Hand) -> Pose:
     """The fingers along the flange's z axis, the palm towards its x axis, and the palm's near end

@@ -241,7 +241,7 @@ class Grasper:
         Raises:
           UnknownConstraintError: the policy does not know one of the constraints.
           ContradictionError: two of them exclude each other.
-          CongraspError: the table obstructs all attempts.
+          CongraspError: the table obstructs all attempts, or the object is out of the arm's reach.
         """
         require_known(request.constraints, self.task)
         if self.left:
@@ -249,6 +249,8 @@ class Grasper:
             request = mirrored_request(request)
         if request.avoid is not None:
             obj = with_avoid(obj, np.asarray(request.avoid))
+        if self._arm:
+            self._arm.require_reach(obj)
         attempted = self._next_round(Attempted(obj, request, ()), progress)
         while not attempted.rounds[-1].meets.any() and self._may_retry(attempted):
             attempted = self._next_round(attempted, progress)

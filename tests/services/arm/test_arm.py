@@ -4,6 +4,7 @@ refusals have names.
 
 import contextlib
 import csv
+import dataclasses
 import io
 import json
 import sys
@@ -287,10 +288,10 @@ def test_numbers_that_are_none(folder, option):
         )
 
 
-def on_the_arm(folder, *options):
+def on_the_arm(folder, *options, attempts=8):
     """Runs `congrasp grasp` for the block on the seven-joint arm; returns its exit code."""
     options = ["--hand", "allegro", "--arm", str(folder / "seven.xml"), *options]
-    options += ["--attempts", "8", "--cache-dir", str(folder)]
+    options += ["--attempts", str(attempts), "--cache-dir", str(folder)]
     return load("grasp")([str(folder / "block.stl"), *options])()
 
 
@@ -385,9 +386,34 @@ def test_pictures_of_a_grasp_on_the_arm(arm_grasp):
     assert np.abs(first - frames[-1]).max() > 60
 
 
-def test_a_base_out_of_reach_is_refused(folder, tmp_path, capsys):
-    base = ["--base", "3 0 0 180", "--no-pictures"]
-    assert on_the_arm(folder, "--out", str(tmp_path), *base) == 2
+def test_no_point_of_arm_and_hand_is_beyond_the_reach(robot):
+    model = robot.model
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(3)
+    of_robot = [
+        model.body(body).name not in ("grasp_table", "grasp_object") for body in model.geom_bodyid
+    ]
+    farthest = 0.0
+    for _ in range(200):
+        data.qpos[:] = rng.uniform(-np.pi, np.pi, model.nq)
+        mujoco.mj_kinematics(model, data)
+        distances = np.linalg.norm(data.geom_xpos, axis=1) + model.geom_rbound
+        farthest = max(farthest, distances[of_robot].max())
+    assert 0.5 * robot.reach < farthest <= robot.reach
+
+
+def test_a_base_beyond_the_reach_is_refused_before_the_simulation(block, folder):
+    hand = get_hand("allegro")
+    options = ArmOptions(arm=str(folder / "seven.xml"), base="3 0 0 180")
+    planner = ArmPlanner(options, hand)
+    with pytest.raises(CongraspError, match=r"base is 3\.00 m away from 'block'.*Set another"):
+        planner.require_reach(block)
+    ArmPlanner(dataclasses.replace(options, base="0.6 0 0 180"), hand).require_reach(block)
+
+
+def test_a_base_that_allows_no_motion_is_refused(folder, tmp_path, capsys):
+    base = ["--base", "1.4 0 0 180", "--no-pictures"]
+    assert on_the_arm(folder, "--out", str(tmp_path), *base, attempts=3) == 2
     message = capsys.readouterr().err
     assert "seven can execute none of the" in message
     assert "the reach" in message
