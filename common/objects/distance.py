@@ -65,6 +65,10 @@ class DistanceField(NamedTuple):
     shape: Array
     """(N, 3) int: grid points along each axis."""
 
+    def repeated(self, times: int) -> "DistanceField":
+        """Returns the grids of the same objects `times` times, one after another."""
+        return DistanceField(*(jnp.concatenate([array] * times) for array in self))
+
     def at(self, index: Array, points: Array) -> Array:
         """Signed distances (B, P) in m; outside a grid, the border's value plus the distance from
         it (an upper bound).

@@ -1,4 +1,4 @@
-"""Rows of one task and of the same objects, simulated in common batches.
+"""Rows of one task, simulated in common batches.
 
 An engine on a device needs nearly as long for a few hundred worlds as for thousands. Episodes do
 not depend on the others of their batch, so a row has the same episodes as in batches of its own.
@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from congrasp.actors.initial import InitialConditions
-from congrasp.services.evaluate.episodes import Episodes, Sample, join_samples
+from congrasp.services.evaluate.episodes import Episodes, Sample, identity, join_samples, reference
 
 
 def run_rows(
@@ -24,7 +24,7 @@ def run_rows(
     """Simulates the episodes of several rows.
 
     Args:
-      simulator: simulator of the rows' task and objects.
+      simulator: simulator of the rows' task, with the objects of all rows.
       rows: initial conditions of the episodes of each row.
       stressed: also simulates the stress test of all episodes (`actors.stress`).
       progress: called with the number of simulated episodes; those of the running batch count by
@@ -47,6 +47,29 @@ def run_rows(
         finished += count
         progress(finished)
     return [join_samples(of_row) for of_row in samples]
+
+
+def with_first_object(conditions: InitialConditions, first: int) -> InitialConditions:
+    """Returns episodes of a row whose objects begin at number `first` among those of all rows."""
+    start = conditions.reset_state
+    start = start._replace(object_index=start.object_index + first)
+    return conditions._replace(reset_state=start)
+
+
+def sample_of_row(sample: Sample, conditions: InitialConditions) -> Sample:
+    """Returns a row's sample with indices of the row's own objects.
+
+    Args:
+      sample: the row's episodes among those of all rows.
+      conditions: the same episodes before `with_first_object`.
+    """
+    index = np.asarray(conditions.reset_state.object_index)
+    of_row = {
+        "object_index": index.astype(sample.values["object_index"].dtype),
+        "identity": identity(conditions),
+        "reference": reference(conditions),
+    }
+    return Sample({**sample.values, **of_row}, sample.link_force, sample.torque)
 
 
 def report_share(progress: Callable[[int], None], finished: int, count: int, share: float) -> None:

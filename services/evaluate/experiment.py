@@ -36,7 +36,12 @@ from congrasp.common.task.sampling.bank import ConstraintBank
 from congrasp.common.task.sampling.build import build_bank, with_columns
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.evaluate import references
-from congrasp.services.evaluate.common_batches import report_share, run_rows
+from congrasp.services.evaluate.common_batches import (
+    report_share,
+    run_rows,
+    sample_of_row,
+    with_first_object,
+)
 from congrasp.services.evaluate.episodes import Batch, Episodes, Sample, join_samples
 from congrasp.services.evaluate.plan import (
     NOMINAL_FRICTION,
@@ -54,6 +59,8 @@ MIN_STRESSED_EPISODES = 200
 """Episodes of a row that continue after the hold with lift and pushes."""
 MAX_MEASURED_OBJECTS = 512
 """Number of objects above which distance fields, and thus plausibility, are skipped."""
+_MAX_JOINED_OBJECTS = 1024
+"""Most objects of rows in common batches, unless a single row has more."""
 _MAX_KEPT_EPISODES = 8
 """Episodes of a row kept for inspection: at most this many that hold the object to the end, and as
 many others.
@@ -130,6 +137,32 @@ class _PlannedRow:
     plan: RowPlan
     file: pathlib.Path | None
     """File of its episodes; None to keep none."""
+
+
+class _JoinedRows:
+    """Rows that run in common batches."""
+
+    def __init__(self) -> None:
+        self.rows: list[_PlannedRow] = []
+        self.objects: list[GraspObject] = []
+        """Objects of all rows; neighbours with the same ones share them."""
+        self.first_objects: list[int] = []
+        """Place of the first object of each row."""
+        self._objects_of_last: Sequence[GraspObject] = ()
+
+    def has_room(self, objects: Sequence[GraspObject]) -> bool:
+        """True if a row with these objects may be added."""
+        if not self.rows or objects is self._objects_of_last:
+            return True
+        return len(self.objects) + len(objects) <= _MAX_JOINED_OBJECTS
+
+    def add(self, row: _PlannedRow, objects: Sequence[GraspObject]) -> None:
+        """Adds a row and its objects."""
+        if objects is not self._objects_of_last:
+            self.objects += objects
+            self._objects_of_last = objects
+        self.rows.append(row)
+        self.first_objects.append(len(self.objects) - len(objects))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -360,8 +393,7 @@ class Experiment:
     ) -> Iterator[tuple[_PlannedRow, Result]]:
         """Simulates rows of one task with one simulator; yields each row with its result.
 
-        On a device, neighbours that share their objects run in common batches, unless episodes are
-        kept.
+        On a device, neighbours run in common batches, unless episodes are kept.
         """
         finished = 0
         if keep or not ENGINES[self.physics].on_device:
@@ -371,39 +403,42 @@ class Experiment:
                     yield row, self._run(running, row, progress_of_row, keep)
                     finished += row.plan.total
             return
-        worlds = self.worlds_for(sum(row.plan.total for row in rows))
-        with self.simulator(task, worlds=worlds) as running:
-            for objects, neighbours in self._by_objects(rows):
-                self._use_objects(running, objects)
-                progress_of_run = functools.partial(advance_from, progress, finished)
-                results = self._run_together(running, neighbours, progress_of_run)
-                yield from zip(neighbours, results, strict=True)
-                finished += sum(row.plan.total for row in neighbours)
+        for joined in self._joined(rows):
+            progress_of_run = functools.partial(advance_from, progress, finished)
+            yield from self._run_together(task, joined, progress_of_run)
+            finished += sum(row.plan.total for row in joined.rows)
 
-    def _by_objects(
-        self, rows: Sequence[_PlannedRow]
-    ) -> Iterator[tuple[Sequence[GraspObject], list[_PlannedRow]]]:
-        """Yields neighbouring rows that share their objects, and these."""
-        objects = [row.variation.objects(self.scaled) for row in rows]
-        pairs = zip(objects, rows, strict=True)
-        for _, group in itertools.groupby(pairs, lambda pair: id(pair[0])):
-            of_group = list(group)
-            yield of_group[0][0], [row for _, row in of_group]
+    def _joined(self, rows: Sequence[_PlannedRow]) -> Iterator[_JoinedRows]:
+        """Yields neighbouring rows that run together."""
+        joined = _JoinedRows()
+        for row in rows:
+            objects = row.variation.objects(self.scaled)
+            if not joined.has_room(objects):
+                yield joined
+                joined = _JoinedRows()
+            joined.add(row, objects)
+        yield joined
 
     def _run_together(
-        self,
-        running: Episodes,
-        rows: Sequence[_PlannedRow],
-        progress: Callable[[int], None],
-    ) -> list[Result]:
-        """Simulates rows of the simulator's task and objects in common batches; all their episodes
-        continue after the hold.
+        self, task: TaskConfig, joined: _JoinedRows, progress: Callable[[int], None]
+    ) -> list[tuple[_PlannedRow, Result]]:
+        """Simulates rows of one task in common batches; all their episodes continue after the
+        hold.
         """
-        conditions = [self._conditions(row.variation, row.plan) for row in rows]
-        samples = run_rows(running, conditions, stressed=running.stressable, progress=progress)
+        conditions = [self._conditions(row.variation, row.plan) for row in joined.rows]
+        of_all_objects = [
+            with_first_object(*pair) for pair in zip(conditions, joined.first_objects, strict=True)
+        ]
+        worlds = self.worlds_for(sum(row.plan.total for row in joined.rows))
+        with self.simulator(task, joined.objects, worlds=worlds) as running:
+            samples = run_rows(
+                running, of_all_objects, stressed=running.stressable, progress=progress
+            )
         results = []
-        for row, sample in zip(rows, samples, strict=True):
-            results.append(Result(row.variation, sample, self.row(row.variation, sample), [], []))
+        for row, sample, planned in zip(joined.rows, samples, conditions, strict=True):
+            of_row = sample_of_row(sample, planned)
+            result = Result(row.variation, of_row, self.row(row.variation, of_row), [], [])
+            results.append((row, result))
         return results
 
     def _conditions(self, variation: Variation, plan: RowPlan) -> InitialConditions:
@@ -446,19 +481,33 @@ class Experiment:
         return [store.digest(obj) for obj in self.objects]
 
     def simulator(
-        self, task: TaskConfig | None = None, *, worlds: int = 0, traced: bool = False
+        self,
+        task: TaskConfig | None = None,
+        objects: Sequence[GraspObject] = (),
+        *,
+        worlds: int = 0,
+        traced: bool = False,
     ) -> Episodes:
-        """Returns a simulator of the objects, by default of the experiment's task and with
-        `self.worlds` parallel worlds.
+        """Returns a simulator.
+
+        Args:
+          task: the experiment's task if None.
+          objects: copies of the experiment's objects with other masses, one after another; these
+            objects themselves if empty.
+          worlds: parallel worlds; `self.worlds` if 0.
+          traced: records every step of every episode.
         """
+        field = self.field
+        if field is not None and objects:
+            field = field.repeated(len(objects) // len(self.scaled))
         return Episodes(
             self.policy,
             task or self.task,
-            self.scaled,
+            objects or self.scaled,
             hold=self.steps,
             batch=worlds or self.worlds,
             physics=self.physics,
-            field=self.field,
+            field=field,
             traced=traced,
         )
 

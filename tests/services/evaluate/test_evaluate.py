@@ -218,6 +218,7 @@ def test_rows_in_common_batches_are_the_same_episodes(experiment, monkeypatch):
         Center(),
         Variation(),
         Load(label="heavy", mass=(2, 2)),
+        Load(label="light", mass=(0.02, 0.02)),
     ]
     alone = experiment.run(variations)
     monkeypatch.setitem(ENGINES, "native", ENGINES["native"]._replace(on_device=True))
