@@ -10,13 +10,13 @@ import json
 import pathlib
 from typing import Annotated, NamedTuple, Self
 
-import dacite
 import tyro
 
 from congrasp.common.config import MetricWriter, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_json
+from congrasp.common.io.records import record_of
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.runtime.resources import cores
 from congrasp.common.transport import urls
@@ -233,8 +233,7 @@ def read_launch(path: pathlib.Path) -> LaunchRecord:
         raise CongraspError(
             f"{path} has format {file_format}; this version of congrasp reads {_FORMAT}.", _REMEDY
         )
-    rules = dacite.Config(strict=True, cast=[tuple, pathlib.Path])
     try:
-        return dacite.from_dict(LaunchRecord, content, rules)
-    except (dacite.DaciteError, TypeError, ValueError) as error:
+        return record_of(LaunchRecord, content)
+    except ValueError as error:
         raise CongraspError(f"{path} is damaged: {error}.", _REMEDY) from None
