@@ -33,6 +33,7 @@ from congrasp.common.transport.keys import FLOWS, Flow, flow
 from congrasp.common.transport.ports import shifted
 from congrasp.common.transport.security import Credentials, secured
 from congrasp.common.transport.zenoh_answers import QueryServer, QueryThreads
+from congrasp.common.transport.zenoh_places import keep_places
 from congrasp.common.transport.zenoh_senders import Senders, Sources
 from congrasp.common.transport.zenoh_session import (
     STAMP,
@@ -141,6 +142,8 @@ class ZenohTransport(Transport):
         except BaseException:
             self.close()
             raise
+        if listen:
+            self._sessions.start(keep_places, self._sessions, zenoh_session.max_peers())
         if credentials:
             self._sessions.watch_revocations(
                 credentials, revocation_seconds, revoked if listen else None
