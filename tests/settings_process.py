@@ -15,7 +15,6 @@ import logging
 import multiprocessing
 import os
 import pathlib
-import random
 import signal
 import sys
 import threading
@@ -188,7 +187,6 @@ def settings_of_process() -> dict[str, Any]:
         "warnings": [*warnings.filters],
         "environment": {name: os.environ.get(name) for name in VARIABLES},
         "jax": {name: getattr(jax.config, name, None) for name in jax.config.values},
-        "random": (random.getstate(), digest(*np.random.get_state(legacy=True)[1:3])),
         "signals": [signal.getsignal(number) for number in sorted(signal.valid_signals())],
         "hooks": (sys.excepthook, sys.unraisablehook, threading.excepthook),
         "logging": (logging.root.level, [*logging.root.handlers], logging.raiseExceptions),
