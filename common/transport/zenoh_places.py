@@ -11,6 +11,8 @@ import itertools
 import math
 import os
 import socket
+import threading
+import time
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
@@ -21,6 +23,14 @@ from congrasp.common.transport.zenoh_session import Sessions
 
 PERIOD_S = 1.0
 """Time between two checks of a listener."""
+GUARD_S = 10.0
+"""Time after the last connection in excess in which the checks are frequent: a crowd that
+reconnects at once would leave the free places to others only for a moment.
+"""
+_GUARD_PERIOD_S = 0.05
+"""Shortest time between two frequent checks."""
+_GUARD_SHARE = 0.1
+"""Largest share of the time that frequent checks take."""
 _FULL = 0.9
 """Share of the places above which connections are ended."""
 _LEFT = 0.75
@@ -49,6 +59,12 @@ class ConnectionPlaces:
         """Watches a listener with this limit of connections."""
         self._places = places
         self._connections: dict[Connection, None] = {}
+        self._guarded_until = -math.inf
+
+    @property
+    def is_guarded(self) -> bool:
+        """True for `GUARD_S` after the last connection in excess."""
+        return time.monotonic() < self._guarded_until
 
     def excess(self, current: Iterable[Connection]) -> list[Connection]:
         """Returns the connections to end.
@@ -59,7 +75,8 @@ class ConnectionPlaces:
         present = dict.fromkeys(current)
         known = [connection for connection in self._connections if connection in present]
         self._connections = dict.fromkeys(itertools.chain(known, present))
-        if len(present) <= _FULL * self._places:
+        limit = _LEFT if self.is_guarded else _FULL
+        if len(present) <= limit * self._places:
             return []
         by_account: dict[str, list[Connection]] = collections.defaultdict(list)
         for connection in self._connections:
@@ -71,18 +88,32 @@ class ConnectionPlaces:
             if len(largest) <= _SMALL_ACCOUNT * self._places:
                 break
             ended.append(largest.pop())
+        if ended:
+            self._guarded_until = time.monotonic() + GUARD_S
         return ended
 
 
 def keep_places(sessions: Sessions, places: int) -> None:
-    """Ends connections in excess until the sessions of a listener are closed; runs in a thread.
+    """Ends connections in excess, in a thread, until the sessions of a listener are closed.
+
+    The thread continues while the sessions are reopened, so that it is none of theirs.
 
     Args:
       sessions: sessions of the listener, one for each flow.
       places: limit of the connections of each.
     """
+    thread = threading.Thread(
+        target=_end_excess, args=(sessions, places), daemon=True, name="zenoh-places"
+    )
+    thread.start()
+
+
+def _end_excess(sessions: Sessions, places: int) -> None:
+    """Ends connections in excess until the sessions are closed."""
     by_flow: dict[str, ConnectionPlaces] = {}
-    while not sessions.closed.wait(PERIOD_S):
+    period = PERIOD_S
+    while not sessions.closed.wait(period):
+        start = time.monotonic()
         excess: list[Connection] = []
         with sessions.inside(), contextlib.suppress(zenoh.ZError):
             for flow, session in sessions.open_sessions():
@@ -90,6 +121,9 @@ def keep_places(sessions: Sessions, places: int) -> None:
                 excess += watched.excess(_connections(session))
         if excess:
             end_connections(excess)
+        period = PERIOD_S
+        if any(watched.is_guarded for watched in by_flow.values()):
+            period = max(_GUARD_PERIOD_S, (time.monotonic() - start) / _GUARD_SHARE)
 
 
 def _connections(session: zenoh.Session) -> list[Connection]:
@@ -98,6 +132,8 @@ def _connections(session: zenoh.Session) -> list[Connection]:
     for link in session.info.links():
         address = host(link.dst)
         port = link.dst.partition("?")[0].rpartition(":")[2]
+        if not port.isdecimal():
+            continue
         account = str(link.auth_identifier or address)
         connections.append(Connection(account, address.strip("[]"), int(port)))
     return connections

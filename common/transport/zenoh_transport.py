@@ -143,7 +143,7 @@ class ZenohTransport(Transport):
             self.close()
             raise
         if listen:
-            self._sessions.start(keep_places, self._sessions, zenoh_session.max_peers())
+            keep_places(self._sessions, zenoh_session.max_peers())
         if credentials:
             self._sessions.watch_revocations(
                 credentials, revocation_seconds, revoked if listen else None

@@ -51,6 +51,18 @@ def test_the_newest_connections_are_ended():
     assert set(places.excess([*new, *old])) == set(new)
 
 
+def test_fewer_places_are_taken_after_an_excess(monkeypatch):
+    """For a while connections in excess of 75 places are ended, then of 90 again."""
+    places = ConnectionPlaces(100)
+    assert len(places.excess(of("a", 91))) == 16
+    assert places.is_guarded
+    assert len(places.excess(of("a", 80))) == 5
+    monkeypatch.setattr(zenoh_places, "GUARD_S", 0.0)
+    assert len(places.excess(of("a", 80))) == 5
+    assert not places.is_guarded
+    assert not places.excess(of("a", 80))
+
+
 def test_a_client_of_another_address_is_served_when_full(monkeypatch):
     """The crowd reconnects whenever it loses a connection."""
     monkeypatch.setattr(zenoh_session, "max_peers", lambda: PLACES)
