@@ -35,7 +35,8 @@ def record_of(cls: type[R], fields: Mapping[str, Any]) -> R:
     """
     if not isinstance(fields, Mapping):
         raise ValueError("it is not an object")
-    rules = dacite.Config(strict=True, type_hooks=dict(_conversions(cls)))
+    conversions = _conversions(cls)  # type: ignore[arg-type]  # a type is hashable
+    rules = dacite.Config(strict=True, type_hooks=dict(conversions))
     try:
         return dacite.from_dict(cls, fields, rules)
     except dacite.WrongTypeError as error:
