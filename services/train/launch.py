@@ -22,6 +22,7 @@ from congrasp.common.runtime.resources import cores
 from congrasp.common.transport import urls
 from congrasp.common.transport.keys import FLOWS
 from congrasp.common.transport.ports import (
+    LAST_PORT,
     LEARNER_URL,
     check_loopback,
     check_ports,
@@ -90,6 +91,11 @@ class Launch:
             )
         if self.ranks < 1:
             raise CongraspError(f"--ranks is {self.ranks}.", "It must be at least 1.")
+        if not 0 <= self.metrics_port <= LAST_PORT:
+            raise CongraspError(
+                f"--metrics-port is {self.metrics_port}.",
+                f"It must be between 0 and {LAST_PORT}.",
+            )
         others_may_join = self.listen is not None or self.certs is not None
         if others_may_join:
             self._check_connections(config.name)
