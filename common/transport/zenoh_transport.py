@@ -256,7 +256,8 @@ class ZenohTransport(Transport):
             raise error_of(code, message.decode(errors="replace"))
         revoked = f", or has revoked the certificate {self._identity}" if self._identity else ""
         raise TransportError(
-            f"No response for {key}.", f"The process that serves it may have ended{revoked}."
+            f"No response for {key}.",
+            f"The process that serves it may have ended, or has another name{revoked}.",
         )
 
     def publish(self, key: str, message: Message) -> None:
