@@ -12,11 +12,11 @@ import json
 import math
 from typing import Annotated, Any, Literal
 
-import dacite
 import tyro
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import file_name
+from congrasp.common.io.records import record_of
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.task.config import RewardWeights, TaskConfig
 
@@ -316,20 +316,17 @@ def run_config_from_json(text: str | bytes) -> RunConfig:
         fields = json.loads(text, parse_constant=_no_constant)
         if not isinstance(fields, dict):
             raise ValueError("it is not an object")
-        if isinstance(ppo := fields.get("ppo"), dict):  # files of earlier versions
-            fields |= {
-                name: ppo.pop(name)
-                for name in ("rollouts_per_update", "max_staleness")
-                if name in ppo
-            }
-        config = dacite.from_dict(
-            RunConfig, fields, dacite.Config(strict=True, cast=[tuple, float])
-        )
     except (ValueError, RecursionError) as error:  # not UTF-8, or nested too deep
         raise CongraspError(
             f"The configuration is not JSON: {error}.", "Regenerate it with 'congrasp train'."
         ) from None
-    except (dacite.DaciteError, TypeError, OverflowError) as error:  # such as null for a number
+    if isinstance(ppo := fields.get("ppo"), dict):  # files of earlier versions
+        fields |= {
+            name: ppo.pop(name) for name in ("rollouts_per_update", "max_staleness") if name in ppo
+        }
+    try:
+        config = record_of(RunConfig, fields)
+    except ValueError as error:
         raise CongraspError(
             f"The configuration does not match this version of congrasp: {error}.",
             "Use the version that wrote it, or start a new run.",

@@ -1,11 +1,14 @@
-"""Limits of tasks and networks that come from files or messages, and limits of a simulation."""
+"""Limits of runs, tasks and networks that come from options, files or messages, and limits of a
+simulation.
+"""
 
 import dataclasses
 import math
+import operator
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from congrasp.common.config import NetworkConfig
+from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.objects.spec import SURFACE_POINTS
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sensors import SENSORS
@@ -34,6 +37,48 @@ _TASK_LIMITS: dict[str, tuple[float, float]] = {
     "trajectory_points": (2, 1000),
     "history": (2, 64),
 }
+_COUNT = (1, math.inf)
+_NOT_NEGATIVE = (0.0, math.inf)
+_POSITIVE = (math.ulp(0.0), math.inf)
+_SHARE = (0.0, 1.0)
+_RUN_LIMITS: dict[str, tuple[float, float]] = {
+    "environments": _COUNT,
+    "rollout_steps": _COUNT,
+    "rollouts_per_update": _COUNT,
+    "max_staleness": _NOT_NEGATIVE,
+    "updates": _COUNT,
+    "checkpoint_every": _COUNT,
+    "collapse_patience": _NOT_NEGATIVE,
+    "episode_every": _COUNT,
+    "log_rollout_every": _NOT_NEGATIVE,
+    "log_rollout_worlds": _NOT_NEGATIVE,
+    "objects.procedural": _NOT_NEGATIVE,
+    "objects.folder_share": _SHARE,
+    "objects.renew_every": _NOT_NEGATIVE,
+    "network.initial_std": _POSITIVE,
+    "ppo.epochs": _COUNT,
+    "ppo.minibatches": _COUNT,
+    "ppo.clip": _POSITIVE,
+    "ppo.importance_max": _POSITIVE,
+    "ppo.gamma": _SHARE,
+    "ppo.gae_lambda": _SHARE,
+    "ppo.learning_rate": _POSITIVE,
+    "ppo.kl_target": _POSITIVE,
+    "ppo.settling": _SHARE,
+    "ppo.final_std": _NOT_NEGATIVE,
+    "ppo.least_std": _NOT_NEGATIVE,
+    "ppo.value_coefficient": _NOT_NEGATIVE,
+    "ppo.max_grad_norm": _POSITIVE,
+    "ppo.reward_scale": _POSITIVE,
+    "distill.epochs": _COUNT,
+    "distill.minibatches": _COUNT,
+    "distill.learning_rate": _POSITIVE,
+    "distill.max_grad_norm": _POSITIVE,
+    "curriculum.stationary_updates": _NOT_NEGATIVE,
+}
+"""Limits of a run's settings."""
+_ORDERED = ("ppo.learning_rate_range", "curriculum.ramp")
+"""Settings of a run with a first and a last value, neither below zero."""
 _SENSING_LIMITS = {
     "period": 10.0,
     "delay": 1.0,
@@ -48,6 +93,47 @@ _MAX_LAYERS = 16
 """Most layers of a network."""
 _MAX_UNITS = 8192
 """Most units of a layer."""
+
+
+def run_faults(config: RunConfig) -> Iterator[str]:
+    """Yields the options of a run and of its task that are out of range, one phrase each."""
+    for name, (low, high) in _RUN_LIMITS.items():
+        value = operator.attrgetter(name)(config)
+        if low <= value <= high and math.isfinite(value):
+            continue
+        yield option_fault("", f"{name} is {value:g}, not {_limits_in_words(low, high)}")
+    for name in _ORDERED:
+        first, last = operator.attrgetter(name)(config)
+        if not 0 <= first <= last < math.inf:
+            yield option_fault("", f"{name} is {first:g} to {last:g}")
+    transitions = config.rollouts_per_update * config.environments * config.rollout_steps
+    if config.algorithm == "ppo" and config.ppo.minibatches > transitions:
+        yield (
+            f"--ppo.minibatches is {config.ppo.minibatches}, more than the {transitions} "
+            "transitions of an update"
+        )
+    for fault in task_faults(config.task):
+        yield option_fault("task.", fault)
+
+
+def _limits_in_words(low: float, high: float) -> str:
+    """Limits of a number in an error."""
+    if (low, high) == _POSITIVE:
+        return "above 0"
+    if high == math.inf:
+        return f"{low:g} or more"
+    return f"{low:g} to {high:g}"
+
+
+def option_fault(group: str, fault: str) -> str:
+    """Returns a phrase that begins with a setting as one that begins with its option.
+
+    Args:
+      group: group of the option, with a dot at its end.
+      fault: the phrase.
+    """
+    name, _, rest = fault.partition(" ")
+    return f"--{group}{name.replace('_', '-')} {rest}"
 
 
 def task_faults(task: TaskConfig) -> Iterator[str]:

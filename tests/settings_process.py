@@ -7,10 +7,17 @@ The digests are of exact results; the last line says which settings of the proce
 
 import concurrent.futures
 import contextlib
+import gc
 import hashlib
 import itertools
+import locale
+import logging
+import multiprocessing
 import os
+import pathlib
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -180,6 +187,12 @@ def settings_of_process() -> dict[str, Any]:
         "warnings": [*warnings.filters],
         "environment": {name: os.environ.get(name) for name in VARIABLES},
         "jax": {name: getattr(jax.config, name, None) for name in jax.config.values},
+        "signals": [signal.getsignal(number) for number in sorted(signal.valid_signals())],
+        "hooks": (sys.excepthook, sys.unraisablehook, threading.excepthook),
+        "logging": (logging.root.level, [*logging.root.handlers], logging.raiseExceptions),
+        "places": (pathlib.Path.cwd(), [*sys.path], locale.setlocale(locale.LC_ALL)),
+        "interpreter": (sys.getrecursionlimit(), sys.getswitchinterval(), gc.isenabled()),
+        "processes": multiprocessing.get_start_method(allow_none=True),
     }
 
 

@@ -31,13 +31,13 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import dacite
 import numpy as np
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.motors import motor_limits
 from congrasp.common.hands.spec import Hand, Joint, Motor, Solid, chain_of
 from congrasp.common.io.inputs import LONGEST_NAME, read_file
+from congrasp.common.io.records import record_of
 
 FORMAT = 1
 MAX_BYTES = 1 << 20
@@ -127,26 +127,14 @@ def _parse_text(text: str) -> Hand:
     del fields["format"]
     if "text" in fields:  # a field of `Hand`, not of its file
         raise _HandFault("not a hand, it has an unknown field 'text'")
-    rules = dacite.Config(strict=True, cast=[tuple], type_hooks={float: _number_of})
     try:
-        hand = dacite.from_dict(Hand, {**fields, "text": text}, rules)
-    except (dacite.DaciteError, TypeError, ValueError, OverflowError) as error:
+        hand = record_of(Hand, {**fields, "text": text})
+    except ValueError as error:
         raise _HandFault(f"not a hand, {str(error)[:200]}") from None
     faults = hand_faults(hand)
     if faults:
         raise _HandFault(faults[0])
     return hand
-
-
-def _number_of(value: object) -> float:
-    """Returns a number of a JSON file as a float.
-
-    Raises:
-      TypeError: it is not a number, but for instance a text or `true`.
-    """
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise TypeError(f"{value!r:.40} is not a number")
-    return float(value)
 
 
 def read_hand(path: pathlib.Path) -> Hand:

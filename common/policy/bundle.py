@@ -13,7 +13,6 @@ import pathlib
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import dacite
 import flax.traverse_util
 import jax
 import jax.numpy as jnp
@@ -25,6 +24,7 @@ from congrasp.common.hands import check_reference, get_hand
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_file
+from congrasp.common.io.records import record_of
 from congrasp.common.policy import network, normalizer
 from congrasp.common.policy.network import Layout, Params
 from congrasp.common.policy.normalizer import Affine, Statistics
@@ -230,14 +230,14 @@ class PolicyBundle:
             )
         try:
             spec = _spec(meta)
-            task = _dataclass(TaskConfig, meta["task"])
+            task = record_of(TaskConfig, meta["task"])
             version = _count(meta, "version")
             transitions = _count(meta, "transitions")
             run_id = str(meta["run_id"])
             _check_ranges(spec, task)
             has_critic = any(name.startswith(f"{_CRITIC}/") for name in message.arrays)
             shapes = _shapes(spec, has_critic)
-        except (*_MALFORMED, CongraspError, dacite.DaciteError) as error:
+        except (*_MALFORMED, CongraspError) as error:
             why = str(error).rstrip(".")[:200]
             raise CongraspError(
                 f"The policy {source} has invalid metadata: {why}.", _REMEDY
@@ -412,20 +412,17 @@ def acting(layout: Layout, *, mean: bool) -> Any:
 
 def _spec(meta: Mapping[str, Any]) -> PolicySpec:
     """Returns the spec in a bundle's metadata."""
-    return PolicySpec(
-        hand=check_reference(meta["hand"]),
-        layout=tuple((str(name), int(size)) for name, size in meta["layout"]),
-        action_size=int(meta["action_size"]),
-        network=_dataclass(NetworkConfig, meta["network"]),
-        privileged=tuple((str(name), int(size)) for name, size in meta["privileged"]),
-    )
+    fields = {field.name: meta[field.name] for field in dataclasses.fields(PolicySpec)}
+    spec = record_of(PolicySpec, fields)
+    check_reference(spec.hand)
+    return spec
 
 
 def _count(meta: Mapping[str, Any], name: str) -> int:
     """Returns a counter in a bundle's metadata; raises a ValueError outside its range."""
-    number = int(meta[name])
-    if not 0 <= number <= _MAX_COUNT:
-        raise ValueError(f"its {name} is {number:.4g}")
+    number = meta[name]
+    if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number <= _MAX_COUNT:
+        raise ValueError(f"its {name} is {number!r:.20}")
     return number
 
 
@@ -436,11 +433,6 @@ def _check_ranges(spec: PolicySpec, task: TaskConfig) -> None:
         raise ValueError(fault)
     for fault in task_faults(task):
         raise ValueError(fault)
-
-
-def _dataclass(cls: type, fields: Any) -> Any:
-    """Builds a frozen dataclass from JSON values; unknown keys and wrong types are errors."""
-    return dacite.from_dict(cls, fields, dacite.Config(strict=True, cast=[tuple, float]))
 
 
 @functools.lru_cache(maxsize=8)

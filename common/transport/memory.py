@@ -114,7 +114,8 @@ class MemoryTransport(Transport):
             )
         if server is None:
             raise TransportError(
-                f"No response for {key}.", "The process that serves it may have ended."
+                f"No response for {key}.",
+                "The process that serves it may have ended, or has another name.",
             )
         question = _Question(key, request, Future())
         try:

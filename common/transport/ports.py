@@ -25,7 +25,8 @@ _FREE_PORTS = 15000
 """Length of that range: it ends below the system's range for outgoing connections (from 32768 on
 Linux), which cannot take these ports."""
 _MAX_ATTEMPTS = 1000
-_LAST_PORT = 65535
+LAST_PORT = 65535
+"""Largest number of a port."""
 _reservations: list[socket.socket] = []
 """Sockets that reserve ports, see `free_port`."""
 
@@ -37,7 +38,7 @@ def shifted(url: str, offset: int) -> str:
       CongraspError: the URL has no port, or the resulting port does not exist.
     """
     match = _URL.fullmatch(url)
-    if not match or not 0 < int(match["port"]) <= _LAST_PORT:
+    if not match or not 0 < int(match["port"]) <= LAST_PORT:
         raise CongraspError(f"'{url}' is not an endpoint.", f"Write it like {LEARNER_URL}.")
     scheme, _, host = match["address"].partition("/")
     if ":" in host and not host.startswith("["):
@@ -46,10 +47,10 @@ def shifted(url: str, offset: int) -> str:
             f"Write it like {scheme}/[{host}]:{match['port']}.",
         )
     port = int(match["port"]) + offset
-    if port > _LAST_PORT:
+    if port > LAST_PORT:
         raise CongraspError(
             f"'{url}' leaves no room for the four ports that a learner takes from this one on.",
-            f"Pass a port up to {_LAST_PORT - len(FLOWS) + 1}; each further rank takes four more.",
+            f"Pass a port up to {LAST_PORT - len(FLOWS) + 1}; each further rank takes four more.",
         )
     return f"{match['address']}:{port}{match['rest'] or ''}"
 

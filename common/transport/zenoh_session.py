@@ -124,7 +124,7 @@ def configuration(
         "transport/shared_memory/enabled": False,  # leaks in the receiver (zenoh #2787)
         "transport/unicast/accept_timeout": _ACCEPT_TIMEOUT_MS,
         "transport/unicast/accept_pending": min(_MAX_HANDSHAKES, max_files // 4),
-        "transport/unicast/max_sessions": min(_MAX_PEERS, max_files // 4),
+        "transport/unicast/max_sessions": max_peers() if listens else _MAX_PEERS,
         "transport/link/tx/lease": _LEASE_MS[name],
         "transport/link/tx/queue/size/data": _MAX_QUEUED_BATCHES,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": _BLOCK_US[name],
@@ -161,6 +161,11 @@ def _open_files() -> int:
             _MAX_FILES,
         )
     return limit
+
+
+def max_peers() -> int:
+    """Limit of the connected peers of each flow of a listener."""
+    return min(_MAX_PEERS, _open_files() // 4)
 
 
 def listen(config: zenoh.Config, endpoints: list[str]) -> zenoh.Session:
@@ -434,6 +439,10 @@ class Sessions:
             self.start(heed_revocations, self, credentials, period)
         else:
             self.start(follow_revocations, self, credentials, revoked, period)
+
+    def open_sessions(self) -> list[tuple[Flow, zenoh.Session]]:
+        """The open sessions with their flows."""
+        return list(self._open.items())
 
     def peers(self) -> set[str]:
         """Common names of the certificates of connected peers."""

@@ -33,6 +33,7 @@ from congrasp.common.transport.keys import FLOWS, Flow, flow
 from congrasp.common.transport.ports import shifted
 from congrasp.common.transport.security import Credentials, secured
 from congrasp.common.transport.zenoh_answers import QueryServer, QueryThreads
+from congrasp.common.transport.zenoh_places import keep_places
 from congrasp.common.transport.zenoh_senders import Senders, Sources
 from congrasp.common.transport.zenoh_session import (
     STAMP,
@@ -141,6 +142,8 @@ class ZenohTransport(Transport):
         except BaseException:
             self.close()
             raise
+        if listen:
+            keep_places(self._sessions, zenoh_session.max_peers())
         if credentials:
             self._sessions.watch_revocations(
                 credentials, revocation_seconds, revoked if listen else None
@@ -253,7 +256,8 @@ class ZenohTransport(Transport):
             raise error_of(code, message.decode(errors="replace"))
         revoked = f", or has revoked the certificate {self._identity}" if self._identity else ""
         raise TransportError(
-            f"No response for {key}.", f"The process that serves it may have ended{revoked}."
+            f"No response for {key}.",
+            f"The process that serves it may have ended, or has another name{revoked}.",
         )
 
     def publish(self, key: str, message: Message) -> None:

@@ -88,9 +88,10 @@ class Options:
         from congrasp.common.named_inputs import identified
         from congrasp.common.policy import bundle as bundles
         from congrasp.learner.run_directory import continue_run, create_run, initial_notes
-        from congrasp.services.train.start import check_config
+        from congrasp.services.train.start import check_config, check_ranges
 
         if self.resumes:
+            check_ranges(config)
             return continue_run(self.run_dir, config, self.initial)
         check_config(config)
         config = identified(config, self.initial)

@@ -8,7 +8,9 @@ from typing import Any
 _CUTOFF = 0.6
 """Least similarity of a suggestion."""
 _NUMBER = re.compile(
-    r"Error parsing (?P<option>\S+): (?:invalid literal for int\(\) with base 10"
+    r"Error parsing (?P<option>\S+): "
+    r"(?:no type matching .*Got errors:\s*- <class '(?:int|float)'>: )?"  # a number or none
+    r"(?:invalid literal for int\(\) with base 10"
     r"|could not convert string to float): (?P<value>.*)",
     re.DOTALL,
 )

@@ -14,6 +14,7 @@ from congrasp.actors.training_set import training_set
 from congrasp.actors.worker import RolloutWorker
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
+from congrasp.common.ranges import task_faults
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.entry import compiling_entry, entry
 from congrasp.common.runtime.resources import cores
@@ -88,6 +89,8 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         config = get_preset(FULL, hand)
         fields = {"reward": config.curriculum.reward, **_task_fields(task)}
         self.task = dataclasses.replace(config.task, **fields)
+        for fault in task_faults(self.task):
+            raise CongraspError(f"The task's {fault}.", "Pass a value in the range.")
         self.hand = get_hand(config.task.hand)
         pool = dataclasses.replace(config.objects, count=objects)
         prepared = training_set(
@@ -235,7 +238,7 @@ class GraspVectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
                 "The actions are not an array of numbers.", f"Pass one of shape {shape}."
             ) from None
         if array.shape != shape:
-            raise CongraspError(f"The actions have shape {array.shape}.", f"It must be {shape}.")
+            raise CongraspError(f"The actions have shape {array.shape}.", f"Pass {shape}.")
         if not jax.numpy.isfinite(array).all():
             raise CongraspError("An action is not finite.", "Pass finite numbers.")
         return array
@@ -301,7 +304,7 @@ class GraspEnv(gym.Env[np.ndarray, np.ndarray]):
         """
         shape = self.action_space.shape
         if np.shape(action) != shape:
-            raise CongraspError(f"The action has shape {np.shape(action)}.", f"It must be {shape}.")
+            raise CongraspError(f"The action has shape {np.shape(action)}.", f"Pass {shape}.")
         observation, reward, terminated, truncated, infos = self._vector.step([action])
         metrics = infos.get(METRICS, {})
         info = {METRICS: {name: float(column[0]) for name, column in metrics.items()}}

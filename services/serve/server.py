@@ -78,7 +78,7 @@ class PolicyServer:
         on_answer: Callable[[str, float], None] = lambda outcome, seconds: None,
         on_batch: Callable[[int], None] = lambda size: None,
     ):
-        """Loads the first policy, and compiles; meanwhile queries get a `StartingError`.
+        """Loads the first policy and compiles; meanwhile queries get a `StartingError`.
 
         Args:
           transport: endpoint of the server.
@@ -93,17 +93,9 @@ class PolicyServer:
           CongraspError: there is no policy yet, or the name is not valid.
         """
         keys = Keys(run)
-        first = source(-1)
-        if first is None:
-            raise CongraspError(
-                "There is no policy to serve yet.",
-                "Start the server after the run has published a policy.",
-            )
         self._source = source
         self._on_answer = on_answer
         self._on_batch = on_batch
-        self._function = PolicyFunction(get_hand(first.spec.hand), first.task)
-        self._served = _prepare(first)
         self._batch_seconds: dict[int, float] = {}
         self._answered = 0
         self._answered_lock = threading.Lock()
@@ -123,13 +115,18 @@ class PolicyServer:
             splitting=Splitting(_SHARED_BATCH_LIMITS, _cut, join_parts, self._infer_again),
         )
         try:
-            self._start(transport, keys)
+            self._register(transport, keys)
+            self._load()
         except BaseException:
             self.close()
             raise
+        self._ready.set()
+        self._follower.start()
 
-    def _start(self, transport: Transport, keys: Keys) -> None:
-        """Registers the handlers, compiles, and follows the source from then on."""
+    def _register(self, transport: Transport, keys: Keys) -> None:
+        """Registers the handlers: before the policy is loaded, since clients of a listening server
+        would get no response.
+        """
         transport.serve(keys.health, self._describe)
         transport.serve(
             below(keys.act),
@@ -139,9 +136,22 @@ class PolicyServer:
             admission=self._admit,
             fair=True,
         )
+
+    def _load(self) -> None:
+        """Loads the first policy and compiles its programs.
+
+        Raises:
+          CongraspError: there is no policy yet.
+        """
+        first = self._source(-1)
+        if first is None:
+            raise CongraspError(
+                "There is no policy to serve yet.",
+                "Start the server after the run has published a policy.",
+            )
+        self._function = PolicyFunction(get_hand(first.spec.hand), first.task)
+        self._served = _prepare(first)
         self._batch_seconds = self._function.warm_up(self._served.inference_parameters)
-        self._ready.set()
-        self._follower.start()
 
     def health(self) -> dict[str, Any]:
         """Readiness, version, hand, queue, and the reason why a newer policy was rejected or cannot

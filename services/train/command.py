@@ -49,6 +49,7 @@ from congrasp.services.train.start import (
     Folder,
     can_resume,
     check_config,
+    check_ranges,
     kept_log,
     removed_without_checkpoint,
 )
@@ -179,6 +180,7 @@ def _prepare(
 ) -> RunConfig:
     """Creates the run's directory, or opens the existing one; returns the run's configuration."""
     if resume:
+        check_ranges(config)
         config = continue_run(run_dir, config, initial)
         if not has_checkpoints(run_dir):
             raise CongraspError(

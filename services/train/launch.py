@@ -10,18 +10,19 @@ import json
 import pathlib
 from typing import Annotated, NamedTuple, Self
 
-import dacite
 import tyro
 
 from congrasp.common.config import MetricWriter, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_json
+from congrasp.common.io.records import record_of
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
 from congrasp.common.runtime.resources import cores
 from congrasp.common.transport import urls
 from congrasp.common.transport.keys import FLOWS
 from congrasp.common.transport.ports import (
+    LAST_PORT,
     LEARNER_URL,
     check_loopback,
     check_ports,
@@ -90,6 +91,11 @@ class Launch:
             )
         if self.ranks < 1:
             raise CongraspError(f"--ranks is {self.ranks}.", "It must be at least 1.")
+        if not 0 <= self.metrics_port <= LAST_PORT:
+            raise CongraspError(
+                f"--metrics-port is {self.metrics_port}.",
+                f"It must be between 0 and {LAST_PORT}.",
+            )
         others_may_join = self.listen is not None or self.certs is not None
         if others_may_join:
             self._check_connections(config.name)
@@ -233,8 +239,7 @@ def read_launch(path: pathlib.Path) -> LaunchRecord:
         raise CongraspError(
             f"{path} has format {file_format}; this version of congrasp reads {_FORMAT}.", _REMEDY
         )
-    rules = dacite.Config(strict=True, cast=[tuple, pathlib.Path])
     try:
-        return dacite.from_dict(LaunchRecord, content, rules)
-    except (dacite.DaciteError, TypeError, ValueError) as error:
+        return record_of(LaunchRecord, content)
+    except ValueError as error:
         raise CongraspError(f"{path} is damaged: {error}.", _REMEDY) from None

@@ -14,6 +14,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands import get_hand
 from congrasp.common.objects.pool import load_pool
 from congrasp.common.policy.bundle import policy_spec
+from congrasp.common.ranges import network_faults, option_fault, run_faults
 from congrasp.common.runtime import platforms
 from congrasp.common.task.sampling.set_file import SUFFIX as SET_SUFFIX
 from congrasp.common.task.sampling.set_file import load
@@ -22,22 +23,29 @@ from congrasp.learner.algorithms import make_algorithm
 from congrasp.learner.checkpoint import Checkpoints
 from congrasp.learner.run_directory import CHECKPOINTS, LOGS, published_version
 
+_OUT_OF_RANGE = "Give a value in the range."
+
+
+def check_ranges(config: RunConfig) -> None:
+    """Raises a `CongraspError` that names the first setting out of its range."""
+    for fault in run_faults(config):
+        raise CongraspError(f"{fault}.", _OUT_OF_RANGE)
+
 
 def check_config(config: RunConfig) -> None:
     """Raises a `CongraspError` for settings with which the run's processes would end at once: its
-    name, algorithm and teacher, objects, constraint sets and sizes.
+    name, ranges, algorithm and teacher, objects and constraint sets.
     """
     Keys(config.name)
-    make_algorithm(policy_spec(config.task, config.network), config)
+    check_ranges(config)
+    spec = policy_spec(config.task, config.network)
+    inputs = (*spec.layout, *spec.privileged)
+    for fault in network_faults(config.network, inputs, spec.action_size):
+        raise CongraspError(f"{option_fault('network.', fault)}.", _OUT_OF_RANGE)
+    make_algorithm(spec, config)
     load_pool(dataclasses.replace(config.objects, count=min(1, config.objects.count)))
     if config.objects.constraints:
         _check_sets(config)
-    if config.environments < 1 or config.rollout_steps < 1:
-        raise CongraspError(
-            f"A rollout of {config.rollout_steps} steps in {config.environments} environments is "
-            "empty.",
-            "Set --rollout-steps and --environments to at least 1.",
-        )
 
 
 def _check_sets(config: RunConfig) -> None:

@@ -35,6 +35,33 @@ def test_invalid_task_is_refused(task):
         run_config_from_json(json.dumps({"task": task}))
 
 
+@pytest.mark.parametrize(
+    ("section", "field", "value", "quoted"),
+    [
+        ("ppo", "clip", "0.1", "'0.1'"),
+        ("ppo", "clip", True, "True"),
+        ("ppo", "clip", 10**400, "10000"),
+        ("ppo", "epochs", True, "True"),
+        ("ppo", "epochs", 4.5, "4.5"),
+        ("ppo", "decoupled", 1, "not 1"),
+        ("ppo", "learning_rate_range", [1e-5, "1e-3"], "'1e-3'"),
+        ("ppo", "learning_rate_range", [1e-5, 1e-4, 1e-3], "list of 2 values"),
+        ("curriculum", "ramp", [True, 3], "True"),
+        ("objects", "families", "mug", "'mug'"),
+        ("network", "hidden", {"units": 4}, "{'units': 4}"),
+    ],
+)
+def test_value_of_another_type_is_named(section, field, value, quoted):
+    fields = json.loads(to_json(get_preset("quickstart")))
+    fields[section][field] = value
+    with pytest.raises(CongraspError) as caught:
+        run_config_from_json(json.dumps(fields))
+    message = str(caught.value)
+    assert f"'{section}.{field}' must be" in message
+    assert quoted in message
+    assert "\n" not in message
+
+
 def test_weights_follow_the_ramp():
     first = RewardWeights(contact=1.0, heading_position=2.0)
     last = dataclasses.replace(first, heading_position=6.0)

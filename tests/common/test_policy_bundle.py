@@ -185,6 +185,17 @@ def _with(message: Message, name: str, value: float) -> Message:
         (lambda m: Message(m.arrays, {**m.meta, "format": 1}), "format 1"),
         (lambda m: Message(m.arrays, {k: v for k, v in m.meta.items() if k != "hand"}), "hand"),
         (lambda m: Message(m.arrays, {**m.meta, "task": {"wheels": 4}}), "wheels"),
+        (
+            lambda m: Message(m.arrays, {**m.meta, "task": {"reward": {"force_max": "0.1"}}}),
+            "reward.force_max.*'0.1'",
+        ),
+        (
+            lambda m: Message(m.arrays, {**m.meta, "task": {"reward": {"force_max": True}}}),
+            "reward.force_max.*True",
+        ),
+        (lambda m: Message(m.arrays, {**m.meta, "action_size": "4"}), "action_size.*'4'"),
+        (lambda m: Message(m.arrays, {**m.meta, "version": True}), "version is True"),
+        (lambda m: Message(m.arrays, {**m.meta, "transitions": "9"}), "transitions is '9'"),
         (lambda m: Message(m.arrays, {**m.meta, "layout": [["state", -3]]}), "layout|meta"),
         (
             lambda m: Message(m.arrays, {**m.meta, "network": {"hidden": [-8], "encoder": 3}}),

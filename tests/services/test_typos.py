@@ -75,6 +75,7 @@ def test_plain_error(text, plain):
         ("query --repeat 2.5", ["--repeat", "'2.5'"]),
         ("query --rate nan", ["--rate", "nan"]),
         ("objects lst", ["lst", "list"]),
+        ("train --actors two", ["--actors", "'two'", "whole number"]),
         ("train --ppo.learning-rat 1", ["--ppo.learning-rate"]),
         ("train --ppo.learning-rate nan", ["--ppo.learning-rate", "nan"]),
         ("grasp mug:0 --size 720p", ["--size", "--video"]),

@@ -106,6 +106,8 @@ def test_gymnasium_makes_it_by_its_id():
         ({"gravity": 1.0}, "The task has no field 'gravity'"),
         ({"hand": "foot"}, "foot"),
         ({"num_envs": 0}, "num_envs is 0"),
+        ({"approach_steps": -3}, "approach_steps is -3, not 1 to 10000"),
+        ({"control_dt": float("nan")}, "control_dt is not a finite number"),
     ],
 )
 def test_unknown_names_and_no_environments(asked, says):

@@ -10,6 +10,7 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 import urllib.request
 from unittest import mock
 
@@ -20,7 +21,13 @@ from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.transport.ports import free_port
 from congrasp.services.cli.main import main
 from congrasp.services.ops.logs import log, log_error, logging_as
-from congrasp.services.ops.metrics import ActorMetrics, LearnerMetrics, ServerMetrics, serve_metrics
+from congrasp.services.ops.metrics import (
+    MAX_CONNECTIONS,
+    ActorMetrics,
+    LearnerMetrics,
+    ServerMetrics,
+    serve_metrics,
+)
 from tests.waits import eventually, together
 
 STATUS = {
@@ -100,6 +107,23 @@ def test_an_actor_shows_its_last_rollout():
     assert scraped["congrasp_actor_rollouts_total",] == 12
     assert scraped["congrasp_actor_version",] == 3
     assert scraped["congrasp_actor_steps_per_second",] == 99
+
+
+def test_silent_connections_do_not_end_scrapes():
+    """They take no threads, and another address is still answered."""
+    port = free_port()
+    address = ("127.0.0.1", port)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(serve_metrics(port, "127.0.0.1", ActorMetrics()))
+        threads = threading.active_count()
+        for _ in range(2 * MAX_CONNECTIONS):
+            silent = stack.enter_context(socket.create_connection(address, 10.0))
+            silent.sendall(b"GET /metrics HTTP/1.1\r\nX: ")
+        assert threading.active_count() == threads
+        other = socket.create_connection(address, 10.0, source_address=("127.0.0.2", 0))
+        stack.enter_context(other)
+        other.sendall(b"GET /metrics HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        assert other.recv(1 << 12).startswith(b"HTTP/1.1 200 ")
 
 
 def test_a_server_counts_answers_and_batches_from_many_threads():

@@ -458,8 +458,8 @@ def test_a_server_needs_a_readable_policy(tmp_path: pathlib.Path):
             PolicyServer(transport, "p", follow_file(broken))
         with pytest.raises(CongraspError, match="no policy to serve"):
             PolicyServer(transport, "p", lambda version: None)
-        with pytest.raises(TransportError):
-            transport.query(Keys("p").health, Message({}, {}), timeout=0.5)
+        health = transport.query(Keys("p").health, Message({}, {}), timeout=0.5).meta
+    assert health == {"ready": False, "state": "closed"}
 
 
 def test_an_invalid_name_is_refused_before_loading():

@@ -1,11 +1,12 @@
 """A policy server while it compiles."""
 
+import concurrent.futures
 import contextlib
 import threading
 
 import pytest
 
-from congrasp.common.errors import StartingError, TransportError
+from congrasp.common.errors import CongraspError, StartingError, TransportError
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.transport.ports import free_port
 from congrasp.common.transport.zenoh_transport import ZenohTransport
@@ -55,6 +56,29 @@ def test_health_reports_compilation(compiling):
         health = eventually(lambda: responding(client))
         assert not health["ready"]
         assert health["state"].startswith("compiling, ")
+
+
+def test_health_responds_while_the_policy_is_loaded():
+    """A client that connects at once waits, instead of getting no response."""
+    loaded = threading.Event()
+
+    def source(version):
+        assert loaded.wait(60)
+
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with (
+        ZenohTransport(listen=[endpoint], flows=("policy",)) as transport,
+        concurrent.futures.ThreadPoolExecutor(1) as threads,
+    ):
+        server = threads.submit(PolicyServer, transport, "policy", source)
+        with PolicyClient(endpoint, wait=0.5) as client:
+            health = eventually(lambda: responding(client))
+            with pytest.raises(StartingError):
+                client.metadata()
+        loaded.set()
+        with pytest.raises(CongraspError, match="no policy to serve"):
+            server.result(60)
+    assert health["state"].startswith("compiling, ")
 
 
 def test_first_act_waits_for_the_server(compiling, example):

@@ -22,15 +22,17 @@ from congrasp.common.episode.motion_file import load_motion
 from congrasp.common.errors import CongraspError
 from congrasp.common.wire.codec import decode
 from congrasp.services.cli.main import main
+from congrasp.services.ops import http_connections
+from congrasp.services.ops.http_server import listening_socket
 from congrasp.services.record.reader import read_episodes
-from congrasp.services.studio import application, browser_sessions, connections
+from congrasp.services.studio import application, browser_sessions
 from congrasp.services.studio import page as page_module
 from congrasp.services.studio import server as server_module
 from congrasp.services.studio.application import STATIC
 from congrasp.services.studio.catalogue import Uploads
 from congrasp.services.studio.recordings import Recordings
 from congrasp.services.studio.routes import Picture, Routes
-from congrasp.services.studio.server import PageServer, listening_socket
+from congrasp.services.studio.server import PageServer
 from congrasp.services.studio.session import Session
 from congrasp.services.studio.training import TrainingWindow
 from tests import studio as fake
@@ -203,7 +205,7 @@ def test_browser_of_another_address_is_served_when_full() -> None:
 
 def test_a_head_that_never_ends_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its bytes come too often for the limit of silence."""
-    monkeypatch.setattr(connections, "TIMEOUT_S", 0.5)
+    monkeypatch.setattr(http_connections, "TIMEOUT_S", 0.5)
     with (
         contextlib.closing(PageServer(lambda browser: Routes({}, {}), "127.0.0.1", 0)) as server,
         socket.create_connection(("127.0.0.1", server.port), timeout=10.0) as slow,
@@ -215,7 +217,7 @@ def test_a_head_that_never_ends_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_client_that_does_not_read_loses_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "TIMEOUT_S", 0.5)
+    monkeypatch.setattr(http_connections, "TIMEOUT_S", 0.5)
     monkeypatch.setattr(server_module, "MAX_CONNECTIONS", 1)
     large = Routes({"/api/large": lambda query: Picture(bytes(64 << 20))}, {})
     with (
@@ -262,7 +264,7 @@ def test_silence_within_a_body_is_answered(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_rest_of_a_refused_body_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "REST_S", 0.2)
+    monkeypatch.setattr(http_connections, "REST_S", 0.2)
     with (
         contextlib.closing(PageServer(lambda browser: Routes({}, {}), "127.0.0.1", 0)) as server,
         _posted(server, "/api/none") as connection,

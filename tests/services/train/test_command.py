@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import math
 import subprocess
 import sys
 import textwrap
@@ -10,7 +11,7 @@ import types
 import pytest
 from rich.console import Console
 
-from congrasp.common.config import NetworkConfig, ObjectsConfig, RunConfig
+from congrasp.common.config import NetworkConfig, ObjectsConfig, PPOConfig, RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.runtime.stages import stage
 from congrasp.common.task.config import TaskConfig
@@ -169,7 +170,15 @@ def test_a_run_that_dies_of_a_full_disk_names_it(printed_lines, monkeypatch, tmp
         ({"task": TaskConfig(hand="paw")}, "no hand 'paw'"),
         ({"objects": ObjectsConfig(families=("unicorn",))}, "unicorn"),
         ({"objects": ObjectsConfig(count=0)}, "pool is empty: objects.count is 0"),
-        ({"environments": 0}, "empty"),
+        ({"environments": 0}, "--environments is 0"),
+        ({"updates": -1}, "--updates is -1"),
+        ({"checkpoint_every": 0}, "--checkpoint-every is 0"),
+        ({"ppo": PPOConfig(clip=0.0)}, "--ppo.clip is 0, not above 0"),
+        ({"ppo": PPOConfig(gamma=math.nan)}, "--ppo.gamma is nan, not 0 to 1"),
+        ({"ppo": PPOConfig(learning_rate_range=(1.0, 0.1))}, "--ppo.learning-rate-range is 1 to"),
+        ({"ppo": PPOConfig(minibatches=10**9)}, "--ppo.minibatches is 1000000000, more than"),
+        ({"task": TaskConfig(approach_steps=-3)}, "--task.approach-steps is -3"),
+        ({"network": NetworkConfig(hidden=(8, 0))}, "--network.hidden is"),
     ],
 )
 def test_a_configuration_that_cannot_run_leaves_no_run_behind(

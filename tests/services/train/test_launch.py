@@ -114,6 +114,16 @@ def test_unreadable_launch_file_is_one_line(tmp_path, capsys, role, content):
     assert str(path) in line
 
 
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("actors", -1), ("ranks", 0), ("metrics_port", -5), ("metrics_port", 65536)],
+)
+def test_launch_out_of_range_is_refused(option, value):
+    launch = dataclasses.replace(Launch(), **{option: value})
+    with pytest.raises(CongraspError, match=f"--{option.replace('_', '-')} is {value}"):
+        launch.planned(get_preset("check"))
+
+
 def test_launch_file_without_actor_names_those_it_has():
     with pytest.raises(CongraspError, match="actor-0, actor-1, actor-2, actor-3"):
         make_record().learner_of_actor("actor-4")

@@ -1,0 +1,80 @@
+"""Places of a listener's connections: one address cannot keep the others out."""
+
+import contextlib
+
+import pytest
+
+from congrasp.common.transport import zenoh_places, zenoh_session
+from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.ports import free_port
+from congrasp.common.transport.zenoh_places import Connection, ConnectionPlaces
+from congrasp.common.transport.zenoh_transport import ZenohTransport
+from congrasp.common.wire.codec import Message
+from tests.bare_zenoh import bare_session
+
+KEYS = Keys("policy")
+PLACES = 16
+
+
+def of(account: str, count: int, first_port: int = 1) -> list[Connection]:
+    """Connections of an account."""
+    ports = range(first_port, first_port + count)
+    return [Connection(account, account, port) for port in ports]
+
+
+@pytest.mark.parametrize(
+    ("counts", "ended"),
+    [
+        ({"a": 90}, {}),  # 90 of 100 places
+        ({"a": 91}, {"a": 16}),
+        ({"a": 80, "b": 12}, {"a": 17}),
+        ({"a": 50, "b": 45}, {"a": 13, "b": 7}),
+        ({str(number): 1 for number in range(100)}, {}),
+        ({str(number): 10 for number in range(10)}, {}),
+        ({"a": 40, **{str(number): 1 for number in range(60)}}, {"a": 25}),
+    ],
+)
+def test_the_account_with_the_most_loses_connections(counts, ended):
+    current: list[Connection] = []
+    for account, count in counts.items():
+        current += of(account, count)
+    excess = ConnectionPlaces(100).excess(current)
+    accounts = [connection.account for connection in excess]
+    assert {account: accounts.count(account) for account in set(accounts)} == ended
+
+
+def test_the_newest_connections_are_ended():
+    places = ConnectionPlaces(100)
+    old = of("a", 75)
+    new = of("a", 20, first_port=1000)
+    assert not places.excess(old)
+    assert set(places.excess([*new, *old])) == set(new)
+
+
+def test_fewer_places_are_taken_after_an_excess(monkeypatch):
+    """For a while connections in excess of 75 places are ended, then of 90 again."""
+    places = ConnectionPlaces(100)
+    assert len(places.excess(of("a", 91))) == 16
+    assert places.is_guarded
+    assert len(places.excess(of("a", 80))) == 5
+    monkeypatch.setattr(zenoh_places, "GUARD_S", 0.0)
+    assert len(places.excess(of("a", 80))) == 5
+    assert not places.is_guarded
+    assert not places.excess(of("a", 80))
+
+
+def test_a_client_of_another_address_is_served_when_full(monkeypatch):
+    """The crowd reconnects whenever it loses a connection."""
+    monkeypatch.setattr(zenoh_session, "max_peers", lambda: PLACES)
+    monkeypatch.setattr(zenoh_places, "PERIOD_S", 0.2)
+    port = free_port()
+    endpoint = f"tcp/127.0.0.1:{port}"
+    with contextlib.ExitStack() as stack:
+        server = stack.enter_context(ZenohTransport(listen=[endpoint], flows=("policy",)))
+        server.serve(KEYS.health, lambda key, message: Message({}, {"ready": True}))
+        for _ in range(PLACES):
+            crowd = bare_session("client", connect=f"{endpoint}#bind=127.0.0.2:0")
+            stack.callback(crowd.close)
+        client = ZenohTransport(connect=[endpoint], flows=("policy",), wait=20.0)
+        stack.enter_context(client)
+        assert client.query(KEYS.health, Message(), timeout=10.0).meta == {"ready": True}
