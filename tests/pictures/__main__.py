@@ -64,9 +64,7 @@ def draw(
     return min(len(failures), 1)
 
 
-def _draw(
-    picture: Picture, places: dict[str, str], folder: pathlib.Path, *, is_drawn: bool
-) -> str:
+def _draw(picture: Picture, places: dict[str, str], folder: pathlib.Path, *, is_drawn: bool) -> str:
     """Draws one picture; returns the reason if it stays, otherwise an empty text.
 
     Args:
