@@ -8,7 +8,7 @@ import pathlib
 import re
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import psutil
@@ -96,11 +96,16 @@ def logged_stages(log: pathlib.Path, began: float) -> list[Stage]:
         if name == _IMPORTS:
             logged.clear()
         logged.append(Stage(name, began + float(ended) - float(seconds), began + float(ended)))
-    return [one for one in logged if not any(_is_within(one, other) for other in logged)]
+    return [one for one in logged if not _is_within_any(one, logged)]
+
+
+def _is_within_any(one: Stage, others: Sequence[Stage]) -> bool:
+    """True if a stage is a part of another one."""
+    return any(_is_within(one, other) for other in others)
 
 
 def _is_within(one: Stage, other: Stage) -> bool:
-    """True if a stage is a part of another one."""
+    """True if a stage is a part of this other one."""
     is_shorter = one.ended - one.began < other.ended - other.began
     begins_within = one.began > other.began - _RESOLUTION_S
     ends_within = one.ended < other.ended + _RESOLUTION_S

@@ -346,14 +346,16 @@ class TrainingProgress:
         )
 
 
-def first_update(logs: pathlib.Path) -> str:
+def first_update(logs: pathlib.Path | None = None) -> str:
     """Stages of this process, of the first learner and of the first actor until the first update,
     one on each line.
 
     Args:
-      logs: folder of the logs of learners and actors.
+      logs: folder of the logs of learners and actors; None if they are in this process.
     """
-    all_stages = [*stages(), *_stages_of_children(logs)]
+    all_stages = stages()
+    if logs is not None:
+        all_stages += _stages_of_children(logs)
     all_stages.sort(key=lambda one: one.began)
     lines = [f"    {one.began:6.1f} to {one.ended:6.1f} s: {one.name}" for one in all_stages]
     return "\n".join(
