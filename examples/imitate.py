@@ -1,7 +1,7 @@
 """Moves a human demonstration to other hands: its heading and affordance drive each hand's own
 policy.
 
-    python examples/imitate.py MyoHand_hammer_use1.npz --meshes object_sim --affordance contacts
+    python examples/imitate.py MyoHand_flashlight_on1.npz --meshes object_sim --affordance contacts
     --hand allegro sharpa
 
 The demonstration provides the approach direction, the point between the fingers, and the parts of

@@ -21,7 +21,7 @@ from congrasp.common.named_inputs import identified
 from congrasp.common.objects.pool import HELD_OUT_SEED, load_pool
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle, policy_spec
-from congrasp.common.runtime.stages import imported, since_start, stages
+from congrasp.common.runtime.stages import Stage, imported, logged_stages, since_start, stages
 from congrasp.learner.algorithms import make_algorithm
 from congrasp.learner.checkpoint import Checkpoints
 from congrasp.learner.run_directory import (
@@ -44,7 +44,7 @@ from congrasp.services.serve.load import example_episode, one_answer, serve_poli
 from congrasp.services.train.launch import Launch, Plan
 from congrasp.services.train.learn import InnerActor, Monitoring, learn
 from congrasp.services.train.presets import FULL, easier
-from congrasp.services.train.processes import ProcessDied, train
+from congrasp.services.train.processes import START, ProcessDied, train
 from congrasp.services.train.start import (
     Folder,
     can_resume,
@@ -62,6 +62,8 @@ _LINE_INTERVAL_S = 10.0
 """Time between two lines of progress without a terminal."""
 _LEAST_FREE_BYTES = 64 << 10
 """Free space below which a disk counts as full."""
+_FIRST_CHILDREN = ("learner.log", "rank-0.log", "actor-0.log")
+"""Logs of the first learner and the first actor."""
 console = Console(highlight=False, soft_wrap=True)
 
 
@@ -99,7 +101,7 @@ def run_training(
         stop = stack.enter_context(on_signal())
         _announce(config, run_dir, plan)
         began = time.monotonic()
-        with TrainingProgress(config) as progress:
+        with TrainingProgress(config, run_dir / LOGS) as progress:
             _train(run_dir, config, plan, stop, progress)
         minutes = (time.monotonic() - began) / 60
         if stop.is_set():
@@ -260,9 +262,15 @@ def untrained(config: RunConfig) -> PolicyBundle:
 class TrainingProgress:
     """One line that is updated on a terminal; elsewhere a line about every ten seconds."""
 
-    def __init__(self, config: RunConfig):
-        """Shows nothing until the context is entered."""
+    def __init__(self, config: RunConfig, logs: pathlib.Path):
+        """Shows nothing until the context is entered.
+
+        Args:
+          config: the run's configuration.
+          logs: folder of the logs of learners and actors.
+        """
         self._config = config
+        self._logs = logs
         self._began = time.monotonic()
         self._last = 0.0
         self._first: tuple[float, float] | None = None
@@ -296,7 +304,7 @@ class TrainingProgress:
         now = time.monotonic()
         if "transitions" in status.get("values", {}):
             if self._first is None:
-                console.print(f"[dim]{first_update()}[/]")
+                console.print(f"[dim]{first_update(self._logs)}[/]")
             self._line = self._progress(status, now)
         elif self._first is None:
             self._line = (
@@ -340,11 +348,18 @@ class TrainingProgress:
         )
 
 
-def first_update() -> str:
-    """Stages of this process until the first update, one on each line; other processes log
-    theirs.
+def first_update(logs: pathlib.Path | None = None) -> str:
+    """Stages of this process, of the first learner and of the first actor until the first update,
+    one on each line.
+
+    Args:
+      logs: folder of the logs of learners and actors; None if they are in this process.
     """
-    lines = [f"    {one.began:6.1f} to {one.ended:6.1f} s: {one.name}" for one in stages()]
+    all_stages = stages()
+    if logs is not None:
+        all_stages += _stages_of_children(logs)
+    all_stages.sort(key=lambda one: one.began)
+    lines = [f"    {one.began:6.1f} to {one.ended:6.1f} s: {one.name}" for one in all_stages]
     return "\n".join(
         [
             f"  First update {since_start():.1f} s after the start; its stages, partly in "
@@ -352,6 +367,19 @@ def first_update() -> str:
             *lines,
         ]
     )
+
+
+def _stages_of_children(logs: pathlib.Path) -> list[Stage]:
+    """Stages of the first learner and the first actor, which other processes resemble."""
+    start = next((one for one in stages() if one.name == START), None)
+    if start is None:  # learner and actor are threads of this process
+        return []
+    children: list[Stage] = []
+    for name in _FIRST_CHILDREN:
+        log = logs / name
+        for one in logged_stages(log, start.began):
+            children.append(one._replace(name=f"{log.stem}: {one.name}"))
+    return children
 
 
 def _show(run_dir: pathlib.Path, config: RunConfig, episodes: int) -> None:

@@ -21,6 +21,8 @@ from congrasp.services.train.launch import LaunchRecord, Plan, write_launch
 
 MAX_RESTARTS = 5
 """Restarts of a process without an update of the run between them."""
+START = "start of the learner's process"
+"""Stage that begins with the start of the learners and actors."""
 _BAD_INPUT_CODE = 2
 _START_TIMEOUT_S = 120.0
 _POLL_S = 0.25
@@ -85,7 +87,7 @@ def train(
     learners = _learners(logs, record, launch_file, gpus=plan.gpus)
     actors = _actors(logs, record, launch_file)
     try:
-        with stage("start of the learner's process"):
+        with stage(START):
             for child in (*learners, *actors):
                 child.start()
             transport = _connect(reachable_url(record.endpoint), learners[0], stop, certs)

@@ -63,3 +63,19 @@ def test_a_failed_stage_is_recorded(stages):
     with pytest.raises(ValueError), stages.stage("failing"):
         raise ValueError
     assert names(stages) == ["failing"]
+
+
+def test_stages_of_another_process_are_those_of_its_last_start(stages, caplog, tmp_path):
+    caplog.set_level("INFO", "congrasp")
+    stages.imported(ended=3.0)
+    lines = [record.getMessage() for record in caplog.records]
+    lines.append("Start: programs took 2.0 s, until 6.0 s after the start of the process.")
+    lines.append("Start: trace _advance took 0.5 s, until 5.0 s after the start of the process.")
+    log = tmp_path / "actor-0.log"
+    log.write_text("\n".join(["info: " + line for line in [*lines, "Died.", *lines]]))
+    logged = stages.logged_stages(log, 10.0)
+    assert logged == [("imports", 10.0, 13.0), ("programs", 14.0, 16.0)]
+
+
+def test_stages_of_an_absent_log_are_none(stages, tmp_path):
+    assert stages.logged_stages(tmp_path / "actor-0.log", 0.0) == []

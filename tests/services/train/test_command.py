@@ -68,10 +68,10 @@ def status(update, **values):
     return {"values": figures, "update": update, "version": update, "actors": 2}
 
 
-def test_progress_counts_the_time_left_from_the_first_update(printed_lines, clock):
+def test_progress_counts_the_time_left_from_the_first_update(printed_lines, clock, tmp_path):
     with stage("a stage"):
         pass
-    with TrainingProgress(CONFIG) as progress:
+    with TrainingProgress(CONFIG, tmp_path) as progress:
         clock.seconds += 30  # compiling
         progress.show({"actors": 2})
         clock.seconds += 30
@@ -106,8 +106,8 @@ def test_progress_counts_the_time_left_from_the_first_update(printed_lines, cloc
         assert words in late
 
 
-def test_progress_away_from_a_terminal_is_a_line_every_ten_seconds(printed_lines, clock):
-    with TrainingProgress(CONFIG) as progress:
+def test_progress_away_from_a_terminal_is_a_line_every_ten_seconds(printed_lines, clock, tmp_path):
+    with TrainingProgress(CONFIG, tmp_path) as progress:
         for _ in range(22):
             clock.seconds += 1.0
             progress.show({"actors": 1})
@@ -120,7 +120,7 @@ def test_progress_away_from_a_terminal_is_a_line_every_ten_seconds(printed_lines
     ]
 
 
-def test_progress_on_a_narrow_terminal_is_wrapped(monkeypatch, clock):
+def test_progress_on_a_narrow_terminal_is_wrapped(monkeypatch, clock, tmp_path):
     output = io.StringIO()
     narrow = Console(
         file=output,
@@ -130,7 +130,7 @@ def test_progress_on_a_narrow_terminal_is_wrapped(monkeypatch, clock):
         soft_wrap=command.console.soft_wrap,
     )
     monkeypatch.setattr(command, "console", narrow)
-    with TrainingProgress(CONFIG) as progress:
+    with TrainingProgress(CONFIG, tmp_path) as progress:
         progress.show(status(1))
         eventually(lambda: "left ?" in output.getvalue())
 
