@@ -360,7 +360,10 @@ def save(bundle: PolicyBundle, path: pathlib.Path) -> None:
 
 def load(path: pathlib.Path) -> PolicyBundle:
     """Reads a bundle from a file; errors name it."""
-    remedy = "Pass a policy file (policy.safetensors in a run's folder)."
+    remedy = (
+        "Pass a policy file (policy.safetensors in a run's folder), or a name "
+        "('congrasp policies list')."
+    )
     data = read_file(path, MAX_MESSAGE, remedy)
     try:
         message = decode(data)

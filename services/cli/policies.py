@@ -109,7 +109,8 @@ class Get:
         entry = _find(self.name, read_index(source, self.timeout), source)
         packaged = packaged_policies().get(entry.name)
         target = self.out or stored_file(entry.name)
-        check_output("--out", target, is_folder=False)
+        option = "--out" if self.out else "The default of --out"
+        check_output(option, target, is_folder=False)
         if packaged is not None and self.out is None:
             if has_content(packaged, entry.sha256):
                 say(f"'{entry.name}' is part of the package: {packaged}")
@@ -171,17 +172,20 @@ def _find(name: str, entries: dict[str, Entry], source: str) -> Entry:
     Raises:
       CongraspError: the index has none.
     """
+    from congrasp.common.policy.pretrained import packaged_policies
+
     if name in entries:
         return entries[name]
-    if not entries:
-        raise CongraspError(
-            f"The index {source} has no policies.",
-            f"Pass --index with the path or address of another one, or set {VARIABLE}.",
-        )
-    similar = nearest(name, entries)
     remedy = f"Choose from: {', '.join(entries)}."
+    similar = nearest(name, entries)
     if similar:
         remedy = f"Did you mean '{similar}'?"
+    if not entries:
+        remedy = (
+            f"It has none: pass --index with the path or address of another one, or set {VARIABLE}."
+        )
+    if name in packaged_policies():
+        remedy = "It is part of the package and needs no download."
     raise CongraspError(f"The index {source} has no policy '{name}'.", remedy)
 
 

@@ -1,5 +1,6 @@
 """Bytes of a file or a web address, within limits of size and time."""
 
+import http
 import http.client
 import pathlib
 import queue
@@ -15,6 +16,7 @@ _SCHEMES = ("http", "https")
 _CHUNK = 1 << 16
 _SILENCE = 20.0
 """Longest silence of a server, s."""
+_ENDED_EARLY = "the connection ended early"
 
 
 def is_web_address(source: str) -> bool:
@@ -111,20 +113,27 @@ def _read_web(address: str, max_bytes: int, end: float) -> bytes:
                 if time.monotonic() > end:
                     raise _late(address)
             if reply.length:
-                raise _unreachable(address, "the connection ended early")
+                raise _unreachable(address, _ENDED_EARLY)
     except urllib.error.HTTPError as error:
-        raise TransportError(
-            f"{address} answers {error.code} {error.reason}.", "Check the address."
-        ) from None
+        raise _refused(address, error.code) from None
     except TimeoutError:
         raise _late(address) from None
     except urllib.error.URLError as error:
         if isinstance(error.reason, TimeoutError):
             raise _late(address) from None
-        raise _unreachable(address, str(error.reason)) from None
+        raise _unreachable(address, _cause(error.reason)) from None
+    except http.client.IncompleteRead:
+        raise _unreachable(address, _ENDED_EARLY) from None
     except (OSError, http.client.HTTPException, ValueError) as error:
-        raise _unreachable(address, str(error)) from None
+        raise _unreachable(address, _cause(error)) from None
     return bytes(content)
+
+
+def _cause(error: Exception | str) -> str:
+    """Text of an error, without the number of an error of the system."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return str(error)
 
 
 def _opener() -> urllib.request.OpenerDirector:
@@ -146,8 +155,28 @@ def _opener() -> urllib.request.OpenerDirector:
 def _too_large(source: str, max_bytes: int) -> CongraspError:
     """Returns the error about content that exceeds the limit."""
     return CongraspError(
-        f"{source} is larger than {max_bytes / 1e6:g} MB.", "Check the address, or raise --limit."
+        f"{source} is larger than the {max_bytes} bytes that are expected.",
+        "Check the address, and a policy's size in the index.",
     )
+
+
+def _refused(address: str, code: int) -> TransportError:
+    """Returns the error about a server that answers with an error.
+
+    Args:
+      address: of the request.
+      code: status of the answer, below 400 for a redirection that is not followed.
+    """
+    if code < http.HTTPStatus.BAD_REQUEST:
+        return TransportError(
+            f"{address} redirects without end, or not to http or https ({code}).",
+            "Check the address.",
+        )
+    remedy = "Check the address."
+    if code >= http.HTTPStatus.INTERNAL_SERVER_ERROR:
+        remedy = "Try again later."
+    answer = f"{code} {http.client.responses.get(code, '')}".rstrip()
+    return TransportError(f"{address} answers {answer}.", remedy)
 
 
 def _late(address: str) -> TransportError:

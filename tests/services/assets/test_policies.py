@@ -12,7 +12,13 @@ import time
 import pytest
 
 from congrasp.common.errors import CongraspError, TransportError
-from congrasp.common.policy.pretrained import named_policy, packaged_file, policy_file, stored_file
+from congrasp.common.policy.pretrained import (
+    SUFFIX,
+    named_policy,
+    packaged_file,
+    policy_file,
+    stored_file,
+)
 from congrasp.common.transport.ports import free_port
 from congrasp.services.assets.policies import index
 from congrasp.services.cli import main
@@ -39,7 +45,11 @@ class Handler(http.server.BaseHTTPRequestHandler):
         else:
             self.send_response(200)
             length = len(content) + self.server.missing
-            self.send_header("Content-Length", str(length))
+            if self.path == self.server.chunked:
+                self.send_header("Transfer-Encoding", "chunked")
+                content = b"100000\r\n" + content[:1000]
+            else:
+                self.send_header("Content-Length", str(length))
             self.end_headers()
             self.server.send(self.wfile, content)
 
@@ -62,6 +72,7 @@ def server():
     host.files = {}
     host.location = ""
     host.missing = 0
+    host.chunked = ""
     host.send = send_all
     thread = threading.Thread(target=host.serve_forever, daemon=True)
     thread.start()
@@ -197,6 +208,17 @@ def test_a_host_that_sends_slowly_meets_the_deadline(server):
     refused(TransportError, text, "--index", source, "--timeout", "0.5")
 
 
+def test_a_policy_of_the_package_needs_no_download():
+    with pytest.raises(CongraspError, match=r"no policy 'human'.*part of the package"):
+        main.run(["policies", "get", "human", "--index", written()])
+
+
+def test_an_interrupted_chunked_answer_ended_early(server):
+    source = served(server)
+    server.chunked = f"/v1/{NAME}{SUFFIX}"
+    refused(TransportError, "ended early", "--index", source)
+
+
 def test_a_missing_file_is_named_with_the_host_s_answer(server):
     source = served(server, address="absent.safetensors")
     refused(TransportError, "absent.safetensors answers 404", "--index", source)
@@ -244,7 +266,7 @@ def test_an_unknown_name_has_a_suggestion():
 
 def test_the_index_of_the_release_names_the_remedy_if_it_is_empty():
     if not index.read_index(index.index_source(), 1.0):
-        refused(CongraspError, f"has no policies.*--index.*{index.VARIABLE}")
+        refused(CongraspError, f"no policy '{NAME}'.*has none.*--index.*{index.VARIABLE}")
 
 
 def test_a_policy_of_the_package_is_not_replaced(capsys):
