@@ -172,6 +172,7 @@ def test_a_child_ends_with_its_parent(tmp_path):
         assert parent.stdout.readline() == "stopped by SIGTERM\n"
 
 
+@pytest.mark.timeout(900)
 @pytest.mark.slow
 def test_an_object_is_imported_and_grasped(tmp_path):
     run(tmp_path, "-m", "congrasp", "objects", "import", MUG, "--out", "objects", "--unit", "m")
@@ -182,6 +183,7 @@ def test_an_object_is_imported_and_grasped(tmp_path):
     assert json.loads(result.read_text(encoding="utf-8"))["attempts"]
 
 
+@pytest.mark.timeout(900)
 @pytest.mark.slow
 def test_a_policy_is_trained_and_served(tmp_path):
     run(
