@@ -330,7 +330,7 @@ class Train:
             patience=60.0 * self.patience,
         )
         train_hand(request, lambda text: print(text, flush=True))
-        print(f"Try: congrasp grasp examples/mug.obj --hand {reference}")
+        print(f"Try: congrasp grasp mug:7 --hand {reference}")
         return 0
 
 

@@ -197,7 +197,7 @@ def usage() -> str:
         "Dexterous grasping under constraints: distributed training and a live policy.\n\n"
         f"{rows}\n\n"
         "Options of every command: --help, and --debug for the trace of an error.\n"
-        "First steps: 'congrasp grasp examples/mug.obj', or a mesh of yours, 'congrasp view', "
+        "First steps: 'congrasp grasp mug:7', or a mesh of yours, 'congrasp view', "
         "'congrasp train'.\n"
     )
 

@@ -176,7 +176,7 @@ def test_the_command_imports_a_hand_once(stages, tmp_path, capsys, monkeypatch):
     assert main.run(command) == 0
     printed = capsys.readouterr().out
     assert "thumb        opposing_lower - opposing_upper" in printed
-    assert "congrasp grasp examples/mug.obj --hand claw" in printed
+    assert "congrasp grasp mug:7 --hand claw" in printed
     file = tmp_path / "hands" / "claw.json"
     hand_text = file.read_text()
     assert main.run(command) == 0
