@@ -85,7 +85,10 @@ def requirements(extra: str, system: System) -> list[str]:
 
 
 def lacking(packages: list[str], system: System, folder: pathlib.Path) -> list[str]:
-    """Requirements that cannot be installed from wheels on a system, with all that they need."""
+    """Requirements that cannot be installed from wheels on a system, with all that they need.
+
+    They are several if each has wheels, and all together exclude one another.
+    """
     command = [sys.executable, "-c", PIP, json.dumps(system.markers), "install", "--dry-run"]
     command += [
         "--quiet",
@@ -105,10 +108,12 @@ def lacking(packages: list[str], system: System, folder: pathlib.Path) -> list[s
     if len(packages) == 1:
         print(done.stderr)
         return packages
-    without_wheel = []
-    for package in packages:
-        without_wheel += lacking([package], system, folder)
-    return without_wheel
+    middle = len(packages) // 2
+    first_half = lacking(packages[:middle], system, folder)
+    second_half = lacking(packages[middle:], system, folder)
+    if not first_half and not second_half:
+        return packages
+    return first_half + second_half
 
 
 @pytest.mark.timeout(1200)
