@@ -3,6 +3,7 @@
 import collections
 import dataclasses
 import functools
+import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -315,7 +316,7 @@ class Grasper:
         episodes, rests, distinct = to_attempt(
             self._hand, self.task, obj, request, self._attempts_count, rng
         )
-        progress("Preparing" if self._compiled else "Compiling (kept for the next time)", 0, 0)
+        progress(self._preparation(), 0, 0)
         self._compiled = True
         steps = self._attempts.simulated_steps
         outcome = self._attempts.run(obj, episodes, lambda step: progress(activity, step, steps))
@@ -323,6 +324,14 @@ class Grasper:
         return Round(
             obj=obj, request=request, episodes=episodes, rests=rests, outcome=outcome, holds=holds
         )
+
+    def _preparation(self) -> str:
+        """Name of the activity before the first step of a round."""
+        if self._compiled:
+            return "Preparing"
+        if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+            return "Compiling (kept for the next time)"
+        return "Compiling"
 
     def _cost(self, attempts: Round) -> np.ndarray:
         """(n,) cost of each attempt, with that of its resting pose."""
