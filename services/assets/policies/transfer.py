@@ -129,7 +129,7 @@ def _read_web(address: str, max_bytes: int, end: float) -> bytes:
     return bytes(content)
 
 
-def _cause(error: Exception | str) -> str:
+def _cause(error: BaseException | str) -> str:
     """Text of an error, without the number of an error of the system."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
