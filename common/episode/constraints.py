@@ -1,4 +1,9 @@
-"""Active constraints of an episode, and their markers."""
+"""Active constraints of an episode, and their markers.
+
+A constraint gates one or more blocks of the observation. Messages store the activity of each block
+(`active/BLOCK`), while users and motion files name constraints. The functions convert one into the
+other.
+"""
 
 from collections.abc import Iterator, Mapping
 
@@ -10,82 +15,93 @@ from congrasp.common.task.constraints.base import Constraint
 from congrasp.common.task.constraints.markers import Marker
 
 _MASK = "goal/mask"
-"""Array of older recordings with the activity of `_BLOCKS_OF_MASK`."""
-_BLOCKS_OF_MASK = ("affordance", "pose_finger", "pose_wrist", "trajectory")
+"""Vector in older recordings, in place of `active/BLOCK`; one number for each of `_MASK_BLOCKS`."""
+_MASK_BLOCKS = ("affordance", "pose_finger", "pose_wrist", "trajectory")
 
 
-def active_blocks(arrays: Mapping[str, np.ndarray]) -> dict[str, bool]:
-    """Activity of each block of the observation by name, from the arrays of a message.
+def block_activity(arrays: Mapping[str, np.ndarray]) -> dict[str, bool]:
+    """Returns the activity of each block of the observation, by name of the block.
+
+    Args:
+      arrays: arrays of a message.
 
     Raises:
       CongraspError: an older message has another number of blocks.
     """
     if _MASK in arrays:
         mask = arrays[_MASK]
-        if mask.shape != (len(_BLOCKS_OF_MASK),):
+        if mask.shape != (len(_MASK_BLOCKS),):
             raise CongraspError(
-                f"The episode's {_MASK} has shape {mask.shape}, not ({len(_BLOCKS_OF_MASK)},)."
+                f"The episode's {_MASK} has shape {mask.shape}, not ({len(_MASK_BLOCKS)},)."
             )
-        return dict(zip(_BLOCKS_OF_MASK, (mask > 0).tolist(), strict=True))
-    blocks = {}
+        return dict(zip(_MASK_BLOCKS, (mask > 0).tolist(), strict=True))
+    activity = {}
     for name, value in arrays.items():
         if name.startswith("active/"):
-            blocks[name.removeprefix("active/")] = bool(value)
-    return blocks
+            activity[name.removeprefix("active/")] = bool(value)
+    return activity
 
 
 def goal_arrays(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Goal arrays by constraint and field, from the arrays of a message."""
-    goal = {}
-    for name, value in arrays.items():
-        if name.startswith("goal/") and name != _MASK:
-            goal[name.removeprefix("goal/")] = value
-    return goal
-
-
-def active_constraints(blocks: Mapping[str, bool]) -> tuple[str, ...]:
-    """Names of the active constraints, weakest first; the heading is always included.
+    """Returns the goal arrays by `CONSTRAINT_FIELD`, such as `heading_direction`.
 
     Args:
-      blocks: activity of each block of the observation, by name.
+      arrays: arrays of a message.
     """
-    return tuple(c.name for c in CONSTRAINTS if _is_active(c, blocks))
+    goals = {}
+    for name, value in arrays.items():
+        if name.startswith("goal/") and name != _MASK:
+            goals[name.removeprefix("goal/")] = value
+    return goals
 
 
-def blocks_of(constraints: tuple[str, ...]) -> dict[str, bool]:
-    """Activity of each block of the observation by name, if all blocks of these constraints are
-    active.
+def active_constraints(activity: Mapping[str, bool]) -> tuple[str, ...]:
+    """Returns the names of the active constraints in the order of priority, lowest first. The
+    constraint `heading` is always active.
+
+    Args:
+      activity: activity of each block of the observation, by name of the block.
     """
-    blocks = {}
+    return tuple(c.name for c in CONSTRAINTS if _is_active(c, activity))
+
+
+def activity_of_constraints(constraints: tuple[str, ...]) -> dict[str, bool]:
+    """Returns the activity of each block of the observation, by name of the block.
+
+    A motion file stores only names of constraints: all of their blocks count as active, the other
+    blocks as inactive.
+    """
+    activity = {}
     for constraint in CONSTRAINTS:
         for block in constraint.blocks:
-            blocks[block] = constraint.name in constraints
-    return blocks
+            activity[block] = constraint.name in constraints
+    return activity
 
 
 def markers(
-    goal: Mapping[str, np.ndarray], blocks: Mapping[str, bool]
+    goals: Mapping[str, np.ndarray], activity: Mapping[str, bool]
 ) -> Iterator[tuple[str, Marker]]:
-    """Yields the markers of each active constraint, with its name.
+    """Yields pairs of the name of an active constraint and one of its markers.
 
     Args:
-      goal: goal arrays by constraint and field.
-      blocks: activity of each block of the observation, by name.
+      goals: goal arrays by `CONSTRAINT_FIELD`, see `goal_arrays`.
+      activity: activity of each block of the observation, by name of the block.
 
     Raises:
       LookupError: a goal array of an active constraint is missing.
     """
-    active = [name for name, is_active in blocks.items() if is_active]
+    active_blocks = [block for block, is_active in activity.items() if is_active]
     for constraint in CONSTRAINTS:
-        if not _is_active(constraint, blocks):
+        if not _is_active(constraint, activity):
             continue
-        fields = [goal[f"{constraint.name}_{field}"] for field in constraint.arrays]
-        for marker in constraint.markers(constraint.goal(*fields), active):
+        values = {field: goals[f"{constraint.name}_{field}"] for field in constraint.arrays}
+        goal_type = constraint.goal
+        for marker in constraint.markers(goal_type(**values), active_blocks):
             yield constraint.name, marker
 
 
-def _is_active(constraint: Constraint, blocks: Mapping[str, bool]) -> bool:
-    """True if a constraint is not optional, or one of its blocks is active."""
+def _is_active(constraint: Constraint, activity: Mapping[str, bool]) -> bool:
+    """Returns True if a constraint is not optional, or one of its blocks is active."""
     if not constraint.optional:
         return True
-    return any(blocks.get(block) for block in constraint.blocks)
+    return any(activity.get(block) for block in constraint.blocks)

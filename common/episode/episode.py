@@ -13,8 +13,8 @@ import numpy as np
 
 from congrasp.common.episode.arm import ARM_META, MovedArm, arm_of_message
 from congrasp.common.episode.constraints import (
-    active_blocks,
     active_constraints,
+    block_activity,
     goal_arrays,
     markers,
 )
@@ -191,7 +191,7 @@ class Episode:
         message = Message(arrays, meta)
         check_message(message)
         hand = known_hand(meta["hand"])
-        active = active_blocks(arrays)
+        active = block_activity(arrays)
         colours = None
         if "colour_values" in arrays:
             colours = Colours(arrays["colour_points"], arrays["colour_values"])

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from congrasp.common.episode.arm import ARM_ARRAYS, arm_of_arrays
-from congrasp.common.episode.constraints import blocks_of
+from congrasp.common.episode.constraints import activity_of_constraints
 from congrasp.common.episode.episode import ARRAYS, Episode
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.arrays import check_arrays, read_npz
@@ -169,7 +169,7 @@ def _parse(meta: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Episode
         **of_file,
         colours=colours,
         goal=goal,
-        active=blocks_of(facts["constraints"]),
+        active=activity_of_constraints(facts["constraints"]),
         arm=arm,
     )
 

@@ -17,7 +17,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.arrays import read_npz
 from congrasp.common.io.inputs import read_file
 from congrasp.common.runtime.confinement import Limits, run_confined
-from congrasp.common.runtime.environment import child_environment
+from congrasp.common.runtime.process_variables import child_environment
 
 MAX_BYTES = 512 << 20
 """Limit in bytes of the pickles read by one process, and of their arrays."""

@@ -1,7 +1,7 @@
 """Detection of forked processes, in which Zenoh's and JAX's threads do not run.
 
-A fork copies one thread alone. Whatever waits for another one then waits without end, inside native
-code that knows no deadline, so calls are refused before they reach it.
+A fork copies one thread alone. A call into one of these libraries that waits for another thread
+would then never return, because their native code has no deadline. So a fork refuses these calls.
 """
 
 import ctypes
@@ -27,18 +27,20 @@ class ForkError(CongraspError):
 
 
 def generation() -> int:
-    """A number that differs between a process and its forks, for `require_same_process`."""
+    """Returns a number that differs between a process and its forks, for
+    `require_same_process`.
+    """
     return _generation
 
 
-def require_same_process(opened: int, what: str) -> None:
+def require_same_process(generation_at_opening: int, what: str) -> None:
     """Raises a ForkError in a fork of the process that opened something.
 
     Args:
-      opened: `generation` when it was opened.
-      what: its name in the message, such as `policy`.
+      generation_at_opening: the return value of `generation` in the process that opened it.
+      what: name of what was opened, such as `policy`, for the message.
     """
-    if opened != _generation:
+    if generation_at_opening != _generation:
         raise ForkError(f"This {what} was opened before the process was forked.")
 
 
@@ -48,7 +50,9 @@ def note_started(library: str) -> None:
 
 
 def detect_jax() -> None:
-    """Records that JAX has started, also by the caller's code; runs before each fork."""
+    """Records that JAX has started, if it has. The package's `__init__` registers a call before
+    each fork, because code outside this package may have started JAX.
+    """
     if _jax_clients():
         note_started("JAX")
 
@@ -60,27 +64,28 @@ def require_not_inherited(library: str) -> None:
 
 
 def keep_to_the_end(native: object) -> None:
-    """Keeps an object alive until the process ends, for a fork in which its destructor would wait
-    for threads that do not run there, or crash.
+    """Keeps an object alive until the process ends. In a fork its destructor would crash, or wait
+    for threads that do not run there.
     """
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(native))
 
 
-def _in_child() -> None:
-    """Counts the fork; what had started is unusable from now on."""
+def _mark_forked() -> None:
+    """Counts the fork, and records the libraries that cannot be used in it."""
     global _generation
     _generation += 1
     _inherited.update(_started)
+    # The clients' destructors would wait for threads that do not run here
     for client in _jax_clients():
         keep_to_the_end(client)
 
 
 def _jax_clients() -> list[object]:
-    """JAX's clients of devices; it has no public function that returns them without starting
-    them.
+    """Returns JAX's clients of devices, if JAX has started. No public function of JAX returns them
+    without starting them.
     """
     bridge = sys.modules.get("jax._src.xla_bridge")
     return list(getattr(bridge, "_backends", {}).values())
 
 
-after_fork(_in_child)
+after_fork(_mark_forked)

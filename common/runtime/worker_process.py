@@ -16,7 +16,7 @@ from multiprocessing.reduction import ForkingPickler
 from typing import IO, Any
 
 from congrasp.common.runtime import platforms
-from congrasp.common.runtime.environment import child_environment
+from congrasp.common.runtime.process_variables import child_environment
 
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"), "1")
 """Environment of workers, whatever that of this process: each would otherwise start a thread for

@@ -55,7 +55,7 @@ class MemoryHub:
     """State shared by the endpoints of one process."""
 
     def __init__(self) -> None:
-        self.opened = forks.generation()
+        self.fork_generation = forks.generation()
         self.lock = threading.Lock()
         self.servers: list[_Server] = []
         self.subscriptions: list[tuple[str, Subscription]] = []
@@ -175,7 +175,7 @@ class MemoryTransport(Transport):
         Waits for its threads: one that releases a device array while the interpreter shuts down
         kills the process.
         """
-        if self._closed or self._hub.opened != forks.generation():
+        if self._closed or self._hub.fork_generation != forks.generation():
             return
         self._closed = True
         self._on_close()
@@ -200,7 +200,7 @@ class MemoryTransport(Transport):
         """Raises a `TransportError` if the endpoint is closed, and a ForkError in a fork, which
         lacks the threads of the hub's endpoints.
         """
-        forks.require_same_process(self._hub.opened, "connection")
+        forks.require_same_process(self._hub.fork_generation, "connection")
         if self._closed:
             raise TransportError("The transport is closed.")
 

@@ -294,7 +294,7 @@ class Sessions:
     """
 
     def __init__(self) -> None:
-        self._opened = forks.generation()
+        self._fork_generation = forks.generation()
         self._open: dict[Flow, zenoh.Session] = {}
         self._openers: dict[Flow, Callable[[], zenoh.Session]] = {}
         self._declarations: list[_Declaration] = []
@@ -391,7 +391,7 @@ class Sessions:
         """Closes the sessions, and waits briefly for the threads; the interpreter's exit waits for
         late ones. A fork leaves the sessions to the process that opened them.
         """
-        if self._opened != forks.generation():
+        if self._fork_generation != forks.generation():
             return
         self.closed.set()
         deadline = time.monotonic() + _CLOSE_TIMEOUT_S
@@ -461,7 +461,7 @@ class Sessions:
 
     def _require_same_process(self) -> None:
         """Raises a ForkError in a fork of the process that opened the sessions."""
-        forks.require_same_process(self._opened, "connection")
+        forks.require_same_process(self._fork_generation, "connection")
 
     def _start_all(self, declaration: _Declaration) -> None:
         """Declares in the current session, and starts the threads; raises a TransportError if there

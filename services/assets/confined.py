@@ -19,8 +19,8 @@ from typing import Any
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.runtime.confinement import Limits, run_confined
-from congrasp.common.runtime.environment import child_environment
 from congrasp.common.runtime.platforms import end_with, limit_this_process, signals_named
+from congrasp.common.runtime.process_variables import child_environment
 from congrasp.services.ops import causes
 
 _ANSWER = "answer.json"

@@ -14,8 +14,8 @@ from typing import Any
 import congrasp
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import cache_folder, can_cache
-from congrasp.common.runtime.environment import own_environment
 from congrasp.common.runtime.platforms import BROKEN_PIPE_CODE
+from congrasp.common.runtime.process_variables import clean_environment
 from congrasp.services.cli import suggestions
 from congrasp.services.cli.checks import check_inputs, check_outputs
 from congrasp.services.cli.errors import failure_of
@@ -206,7 +206,7 @@ def prepare_environment() -> None:
     """Removes settings of other programs from the environment, and configures caches of compiled
     programs and compiler output, unless the user has.
     """
-    own_environment()
+    clean_environment()
     ensure_width()
     for message in _NUMPY_WARNINGS:
         warnings.filterwarnings("ignore", message, RuntimeWarning)

@@ -8,8 +8,8 @@ import threading
 import warnings
 from typing import NoReturn, TextIO
 
-from congrasp.common.runtime.environment import child_environment
 from congrasp.common.runtime.platforms import STOP_SIGNALS, replace_process
+from congrasp.common.runtime.process_variables import child_environment
 from congrasp.services.ops.lifetime import SIGNALS
 
 SIGNALLED = tuple(128 + number for number in STOP_SIGNALS)

@@ -16,8 +16,10 @@ CAMERA = "camera_position"
 """Name of the position of the camera."""
 MEASURED = ("q", "u", "object_position", "object_quaternion")
 """Fields that every state has, unless the policy has a camera."""
-RESTING_POSE = ("object_position_initial", "object_quaternion_initial")
-"""Names of the object's pose at the start of the episode."""
+INITIAL_POSE = ("object_position_initial", "object_quaternion_initial")
+"""Fields with the object's pose at the start of the episode, or the mean while it rests."""
+WRIST_DOF = 6
+"""Number of the virtual wrist joints: translations, then rotations."""
 _REQUIRED = ("surface", "q", "wrist", "object_pose")
 _REQUIRED_WITH_CAMERA = ("cloud", "q", "wrist")
 _MAX_SPREAD = 1.0  # m, median deviation of points
@@ -32,8 +34,8 @@ def require(names: Sequence[str], fields: Mapping[str, Any]) -> None:
         raise RefusedError(f"The query lacks the field '{lacking[0]}'.")
 
 
-def numbers(name: str, value: Any) -> np.ndarray:
-    """A field's value, unchanged if it is bool, else as float32.
+def as_numbers(name: str, value: Any) -> np.ndarray:
+    """Returns a field's value as an array, unchanged if it is bool, else as float32.
 
     Raises:
       RefusedError: the value is not a numeric array.
@@ -51,7 +53,7 @@ def checked(values: Mapping[str, Any]) -> dict[str, np.ndarray]:
     Raises:
       RefusedError: a field is not a numeric array, or is in mm, cm or degrees.
     """
-    fields = {name: numbers(name, value) for name, value in values.items()}
+    fields = {name: as_numbers(name, value) for name, value in values.items()}
     # Numbers that are not finite are refused by the first `act`
     with np.errstate(invalid="ignore"):
         for name in ("surface_points", "cloud"):
@@ -110,7 +112,7 @@ def episode_fields(request: GraspRequest) -> dict[str, np.ndarray]:
     values = {
         "q_initial": request.q,
         "q_target": request.q,
-        "u_target": np.zeros(6),
+        "u_target": np.zeros(WRIST_DOF),
         "base_position": base_position,
         "base_quaternion": base_quaternion,
         "object_position_initial": position,

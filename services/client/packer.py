@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 
 from congrasp.common.errors import RefusedError
 from congrasp.common.wire.codec import Message
-from congrasp.services.client.fields import CAMERA, MEASURED, NORMALS, checked, numbers, require
+from congrasp.services.client.fields import CAMERA, MEASURED, NORMALS, as_numbers, checked, require
 from congrasp.services.client.policy import State
 
-PACKED = "packed"
+PACKED_ARRAY = "packed"
 """Name of the one array of a query or a reply."""
 HISTORY_FIELDS = (*MEASURED, "q_target", "u_target")
 """Fields of earlier control steps, which a policy with history observes."""
@@ -86,13 +86,13 @@ class Packer:
             require(required, state)
             self._write(vector, checked(state))
             self._write(vector, self._earlier_steps(past or [state]))
-        return Message({PACKED: vectors}, self._meta)
+        return Message({PACKED_ARRAY: vectors}, self._meta)
 
     def _earlier_steps(self, past: Sequence[State]) -> dict[str, np.ndarray]:
         """Fields (steps, ...) of earlier control steps, of which the oldest is repeated."""
         fields = {}
         for name, steps in self._history.items():
-            rows = [numbers(name, reading[name]) for reading in past[:steps]]
+            rows = [as_numbers(name, reading[name]) for reading in past[:steps]]
             rows += rows[-1:] * (steps - len(rows))
             fields[f"past_{name}"] = np.stack(rows)
         return fields

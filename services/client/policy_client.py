@@ -76,12 +76,12 @@ class PolicyClient(EpisodePolicy):
 
     def metadata(self) -> dict[str, Any]:
         """See `Policy.metadata`; waits for a server that is starting."""
-        forks.require_same_process(self._opened, "policy")
-        return self._patiently(self._metadata)
+        forks.require_same_process(self._fork_generation, "policy")
+        return self._patiently(self._query_metadata)
 
-    def _described(self) -> dict[str, Any]:
+    def _fetch_metadata(self) -> dict[str, Any]:
         """The metadata; only the first call waits, since later ones are part of a control loop."""
-        return self._metadata() if self._is_known else self.metadata()
+        return self._query_metadata() if self._is_known else self.metadata()
 
     def _patiently(self, ask: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """Repeats a query until a server that is starting answers it, for the seconds to wait."""
@@ -95,7 +95,7 @@ class PolicyClient(EpisodePolicy):
                     raise
                 time.sleep(_AGAIN)
 
-    def _metadata(self) -> dict[str, Any]:
+    def _query_metadata(self) -> dict[str, Any]:
         """The metadata of a server that responds."""
         query = Message({}, {"metadata": True})
         reply = self._transport.query(self._keys.health, query, timeout=self._timeout)

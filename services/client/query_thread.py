@@ -31,7 +31,7 @@ class QueryThread:
 
     def __init__(self, policy: Policy):
         self._policy = policy
-        self._opened = forks.generation()
+        self._fork_generation = forks.generation()
         self._changed = threading.Condition()
         self._request: GraspRequest | None = None
         self._question: _Question | None = None
@@ -50,7 +50,7 @@ class QueryThread:
 
     def require_same_process(self) -> None:
         """Raises a ForkError in a fork of this process, where the thread does not run."""
-        forks.require_same_process(self._opened, "guard")
+        forks.require_same_process(self._fork_generation, "guard")
 
     def begin(self, request: GraspRequest) -> None:
         """Begins an episode."""
@@ -90,7 +90,7 @@ class QueryThread:
         """Ends the thread, unless a query blocks it, and closes the policy; a fork leaves both to
         the process that opened them.
         """
-        if self._opened != forks.generation():
+        if self._fork_generation != forks.generation():
             return
         with self._changed:
             self._closed = True

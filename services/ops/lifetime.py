@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from congrasp.common.errors import os_errors_as
 from congrasp.common.io.opening import open_to_append
 from congrasp.common.runtime import platforms
-from congrasp.common.runtime.environment import child_environment
+from congrasp.common.runtime.process_variables import child_environment
 from congrasp.services.ops import causes
 
 GRACE_S = 3.5

@@ -32,7 +32,7 @@ from congrasp.common.wire.codec import Message
 from congrasp.services.client.episode_policy import EpisodePolicy
 from congrasp.services.client.left_policy import LeftPolicy
 from congrasp.services.client.limits import JointLimits
-from congrasp.services.client.packer import PACKED
+from congrasp.services.client.packer import PACKED_ARRAY
 from congrasp.services.client.policy import Policy
 from congrasp.services.serve.requests import STATES_LIMIT, Layout, Query
 
@@ -52,7 +52,7 @@ class Inference(NamedTuple):
 
     def reply(self, meta: Mapping[str, Any]) -> Message:
         """Returns it as a message with further metadata, at least `version` and `total_ms`."""
-        return Message({PACKED: self.vectors}, {**meta, "active": self.active})
+        return Message({PACKED_ARRAY: self.vectors}, {**meta, "active": self.active})
 
 
 class _Outputs(NamedTuple):
@@ -243,7 +243,7 @@ class LocalPolicy(EpisodePolicy):
         self._function.warm_up(bundle.inference_parameters, BATCH_SIZES[:1])
 
     @library_settings()
-    def _described(self) -> dict[str, Any]:
+    def _fetch_metadata(self) -> dict[str, Any]:
         """The metadata of the bundle."""
         return self._function.metadata()
 

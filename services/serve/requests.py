@@ -49,7 +49,7 @@ from congrasp.common.task.sensors.base import world_pose
 from congrasp.common.task.types import CONTACTS_PER_LINK, Goal, SceneState, Surface
 from congrasp.common.wire.codec import Message
 from congrasp.services.client.fields import CAMERA, NORMALS
-from congrasp.services.client.packer import PACKED
+from congrasp.services.client.packer import PACKED_ARRAY
 
 STATES_LIMIT = 64
 """Most states in one query."""
@@ -193,7 +193,7 @@ class Layout:
           LayoutError: it is not in this layout.
           CongraspError: it names no valid constraints, or has too many states.
         """
-        vectors = message.arrays.get(PACKED)
+        vectors = message.arrays.get(PACKED_ARRAY)
         fits = (
             vectors is not None
             and vectors.ndim == 2

@@ -9,8 +9,8 @@ from typing import NamedTuple
 from congrasp.actors.physics import resolve_physics
 from congrasp.common.errors import CongraspError
 from congrasp.common.runtime.engines import ENGINES, PhysicsName
-from congrasp.common.runtime.environment import child_environment
 from congrasp.common.runtime.lazy_jax import jax
+from congrasp.common.runtime.process_variables import child_environment
 from congrasp.common.runtime.stages import stage
 
 _START_TIMEOUT_S = 120.0

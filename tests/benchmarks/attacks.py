@@ -161,7 +161,7 @@ class _QueryRecorder(EpisodePolicy):
         self._metadata = metadata
         self.query = Message()
 
-    def _described(self) -> dict[str, Any]:
+    def _fetch_metadata(self) -> dict[str, Any]:
         return self._metadata
 
     def _query(self, query: Message) -> Message:

@@ -279,7 +279,7 @@ def file():
 
 def marker():
     """What pictures, recordings and the studio's player draw of it."""
-    from congrasp.common.episode.constraints import active_blocks, goal_arrays, markers
+    from congrasp.common.episode.constraints import block_activity, goal_arrays, markers
 
     heading = {
         "position": np.zeros(3),
@@ -288,7 +288,7 @@ def marker():
     }
     arrays = {f"goal/heading_{name}": value for name, value in heading.items()}
     arrays |= {"goal/level_wrist": np.array([True]), "active/level": np.bool_(True)}
-    drawn = dict(markers(goal_arrays(arrays), active_blocks(arrays)))
+    drawn = dict(markers(goal_arrays(arrays), block_activity(arrays)))
     assert list(drawn) == ["heading", "level"]
     assert drawn["level"].points[1, 2] == 0.01
 

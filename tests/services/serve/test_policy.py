@@ -355,7 +355,7 @@ class Recorder(EpisodePolicy):
         self.function = PolicyFunction(get_hand(task.hand), task)
         self.sent = []
 
-    def _described(self):
+    def _fetch_metadata(self):
         return self.function.metadata()
 
     def _query(self, query):
