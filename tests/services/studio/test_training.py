@@ -4,6 +4,7 @@ import pathlib
 import struct
 import threading
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message
+from congrasp.services.record.reader import Record, read_records
 from congrasp.services.record.recorder import Recorder
 from congrasp.services.studio import recordings as recordings_module
 from congrasp.services.studio.recordings import Recordings
@@ -186,6 +188,29 @@ def test_episodes_around_a_time_come_from_finished_and_from_growing_files(
         recordings.episode("nothing")
 
 
+def test_a_growing_file_is_read_once_a_search(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch, caplog: Any
+) -> None:
+    fake.record(tmp_path, [(BEGIN, 1)])
+    file = next(tmp_path.glob("*.mcap"))
+    growing = tmp_path / f"{file.name}.part"
+    growing.write_bytes(file.read_bytes()[:-200])
+    file.unlink()
+    reads = []
+
+    def count_reads(path: pathlib.Path, *arguments: Any) -> Iterator[Record]:
+        reads.append(path)
+        return read_records(path, *arguments)
+
+    monkeypatch.setattr(recordings_module, "read_records", count_reads)
+    caplog.clear()
+    reach, rows = Recordings(tmp_path).around(BEGIN + 20, 1.0)
+    assert reach == 25.0
+    assert [row["actor"] for row in rows] == ["a001"]
+    assert reads == [growing]
+    assert not caplog.text
+
+
 def test_only_the_damaged_part_of_a_finished_file_is_lost(
     tmp_path: pathlib.Path, caplog: Any
 ) -> None:
@@ -212,7 +237,7 @@ def test_only_the_damaged_part_of_a_finished_file_is_lost(
 def test_of_many_episodes_the_nearest_are_taken(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recordings_module, "MOST", 3)
+    monkeypatch.setattr(recordings_module, "MAX_EPISODES", 3)
     fake.record(tmp_path, [(BEGIN + n, n) for n in range(5)])
     _, rows = Recordings(tmp_path).around(BEGIN, 1000.0)
     assert [row["actor"] for row in rows] == ["a000", "a001", "a002"]
