@@ -131,9 +131,9 @@ def test_links_are_where_mujoco_has_them(physx, name):
     engine.start(start)
     environment = engine.environments[0]
     model = environment.scene.model
-    model.body_pos[environment.scene.where.base_body] = FAR[0]
+    model.body_pos[environment.scene.addresses.base_body] = FAR[0]
     data = mujoco.MjData(model)
-    data.qpos[environment.scene.where.finger_qpos] = q
+    data.qpos[environment.scene.addresses.finger_qpos] = q
     mujoco.mj_kinematics(model, data)
     for body, link in environment.hand.bodies.items():
         np.testing.assert_allclose(link.entity_pose.p / LENGTH, data.xpos[body], atol=1e-5)
@@ -378,6 +378,7 @@ def test_a_diverged_environment_is_marked_and_put_back(physx):
     state, after = engine.step(state, hold, np.ones(2, bool))
     np.testing.assert_array_equal(after.diverged, [False, True])
     np.testing.assert_allclose(after.object_position[1], start.object_position[1], atol=1e-6)
+    np.testing.assert_array_equal(after.contact_position[1], 0.0)
     state, after = engine.step(state, hold, np.ones(2, bool))
     assert not after.diverged.any()
     np.testing.assert_allclose(after.object_position, start.object_position, atol=1e-3)

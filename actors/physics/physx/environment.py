@@ -19,7 +19,7 @@ class CompiledScene(NamedTuple):
     """MuJoCo's scene of one object, and what is derived from it."""
 
     model: mujoco.MjModel
-    where: Addresses
+    addresses: Addresses
     collisions: Collisions
     links: tuple[int, ...]
     """Bodies of the hand's links, in their order."""
@@ -30,29 +30,29 @@ class Environment:
     so that nothing of an episode, such as the contacts that PhysX caches, affects the next.
     """
 
-    def __init__(self, scene: CompiledScene, start: ResetState):
+    def __init__(self, scene: CompiledScene, reset_state: ResetState):
         """Builds the environment at the start of an episode.
 
         Args:
           scene: the scene of its object.
-          start: the start, without the dimension B.
+          reset_state: the start, without the dimension B.
         """
         self.scene = scene
-        self.start = start
+        self.reset_state = reset_state
         model = scene.model
         configure(model.opt.gravity, LENGTH)
         self.system = px.PhysxCpuSystem()
         self.system.timestep = model.opt.timestep
         # The scene keeps the entities; sapien's default would have a renderer.
         self._sapien_scene = sapien.Scene([self.system])
-        self.friction = float(start.friction)
+        self.friction = float(reset_state.friction)
         surfaces = frictions(model, self.friction)
         self.hand = Articulation(
             self._sapien_scene,
             model,
             scene.collisions,
             material(surfaces.link),
-            _hand_start(model, scene.where, start),
+            _hand_start(model, scene.addresses, reset_state),
         )
         self._has_table = True
         self._add_object(surfaces)
@@ -87,46 +87,46 @@ class Environment:
         """Writes the state into qpos (nq,) and qvel (nv,) of the compiled scene, but the object's
         angular velocity in the world frame.
         """
-        where = self.scene.where
+        addresses = self.scene.addresses
         self.hand.read(qpos, qvel)
         pose = self.object.entity_pose
-        qpos[where.object_qpos[:3]] = pose.p / LENGTH
-        qpos[where.object_qpos[3:]] = pose.q
-        qvel[where.object_qvel[:3]] = self.object.linear_velocity / LENGTH
-        qvel[where.object_qvel[3:]] = self.object.angular_velocity
+        qpos[addresses.object_qpos[:3]] = pose.p / LENGTH
+        qpos[addresses.object_qpos[3:]] = pose.q
+        qvel[addresses.object_qvel[:3]] = self.object.linear_velocity / LENGTH
+        qvel[addresses.object_qvel[3:]] = self.object.angular_velocity
 
     def _add_object(self, surfaces: Frictions) -> None:
         """Adds the object."""
         model = self.scene.model
-        start = self.start
-        index = self.scene.where.object_body
+        reset_state = self.reset_state
+        index = self.scene.addresses.object_body
         body = px.PhysxRigidDynamicComponent()
         for geom in np.flatnonzero(model.geom_bodyid == index).tolist():
             shape = geom_shape(model, geom, material(surfaces.object))
             collisions = self.scene.collisions
             shape.set_collision_groups([collisions.own_bit[index], collisions.others[index], 0, 0])
             body.attach(shape)
-        mass = start.mass_scale * model.body_mass[index]
-        principal = start.mass_scale * model.body_inertia[index]
+        mass = reset_state.mass_scale * model.body_mass[index]
+        principal = reset_state.mass_scale * model.body_inertia[index]
         set_inertia(
             body, mass, principal, scaled_pose(model.body_ipos[index], model.body_iquat[index])
         )
         # PhysX damps at a rate; MuJoCo's damping is a force or torque per speed
-        damping = model.dof_damping[self.scene.where.object_qvel]
+        damping = model.dof_damping[self.scene.addresses.object_qvel]
         body.linear_damping = float(damping[0] / mass)
         body.angular_damping = float(damping[3] / principal.mean())
         body.max_angular_velocity = MAX_SPEED
-        body.kinematic = bool(start.stationary)
+        body.kinematic = bool(reset_state.stationary)
         entity = sapien.Entity()
         entity.add_component(body)
-        entity.set_pose(scaled_pose(start.object_position, start.object_quaternion))
+        entity.set_pose(scaled_pose(reset_state.object_position, reset_state.object_quaternion))
         self._sapien_scene.add_entity(entity)
         self.object = body
 
     def _add_tables(self, surfaces: Frictions) -> None:
         """Adds two planes at z = 0, for the object and for the hand: they differ in friction."""
         collisions = self.scene.collisions
-        objects_bit = collisions.own_bit[self.scene.where.object_body]
+        objects_bit = collisions.own_bit[self.scene.addresses.object_body]
         self._tables = [
             self._add_plane(surfaces.table_to_object, collisions.table & objects_bit),
             self._add_plane(surfaces.table_to_link, collisions.table & ~objects_bit),
@@ -144,12 +144,14 @@ class Environment:
         return entity
 
 
-def _hand_start(model: mujoco.MjModel, where: Addresses, start: ResetState) -> HandStart:
-    """Start of the hand; the wrist joints are at zero."""
+def _hand_start(model: mujoco.MjModel, addresses: Addresses, reset_state: ResetState) -> HandStart:
+    """Returns the start of the hand; the wrist joints are at zero."""
     qpos = np.zeros(model.nq, np.float32)
-    qpos[where.finger_qpos] = start.q
+    qpos[addresses.finger_qpos] = reset_state.q
     qvel = np.zeros(model.nv, np.float32)
-    qvel[where.wrist_qvel] = start.u_velocity
+    qvel[addresses.wrist_qvel] = reset_state.u_velocity
     gains = np.ones(model.nu)
-    gains[where.motors] = start.gain_scale
-    return HandStart(scaled_pose(start.base_position, start.base_quaternion), qpos, qvel, gains)
+    gains[addresses.motors] = reset_state.gain_scale
+    return HandStart(
+        scaled_pose(reset_state.base_position, reset_state.base_quaternion), qpos, qvel, gains
+    )

@@ -34,6 +34,12 @@ class Coupling(NamedTuple):
     """rad."""
 
 
+def check_transmission(model: mujoco.MjModel) -> None:
+    """Raises a CongraspError if PhysX cannot simulate a motor or a coupling of the hand."""
+    servos_of(model)
+    couplings_of(model)
+
+
 def servos_of(model: mujoco.MjModel) -> dict[int, Servo]:
     """Returns the servos by the indices of the joints that they pull.
 
