@@ -63,14 +63,14 @@ def stage(name: str) -> Iterator[None]:
         _add(Stage(name, began, since_start()))
 
 
-def imported(ended: float | None = None) -> None:
-    """Records everything up to now as the stage of imports, and from now on JAX's work on programs
-    as stages.
+def record_import_stage(ended_s: float | None = None) -> None:
+    """Records the time since the start of this process as the stage of imports. From now on JAX's
+    work on programs is recorded as stages.
 
     Args:
-      ended: the end of the imports in seconds since this process began, if it is earlier.
+      ended_s: the end of the imports in seconds since this process began, if it is earlier.
     """
-    _add(Stage(_IMPORTS, 0.0, since_start() if ended is None else ended))
+    _add(Stage(_IMPORTS, 0.0, since_start() if ended_s is None else ended_s))
     jax.monitoring.register_event_duration_secs_listener(_add_program)
 
 

@@ -17,7 +17,7 @@ from rich.table import Table
 from congrasp.common.config import RunConfig
 from congrasp.common.errors import CongraspError
 from congrasp.common.runtime.engines import PhysicsName
-from congrasp.common.runtime.stages import imported, since_start, stages
+from congrasp.common.runtime.stages import record_import_stage, since_start, stages
 from congrasp.services.train.learn import until_first_update
 
 _STOPPED_SECONDS = 30.0
@@ -108,7 +108,7 @@ def _environment(variables: Mapping[str, str]) -> Iterator[None]:
 
 def _first_update(config: RunConfig, physics: PhysicsName, results: Connection) -> None:
     """Trains until the first update, and sends the stages of the start."""
-    imported()
+    record_import_stage()
     programs = collections.Counter[str]()
 
     def count(event: str, duration_secs: float, **about: str | int) -> None:

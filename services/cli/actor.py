@@ -1,4 +1,4 @@
-"""`congrasp actor`: one actor."""
+"""`congrasp actor`: one actor. Heavy imports are inside functions, so that `--help` is quick."""
 
 import dataclasses
 import importlib
@@ -16,9 +16,9 @@ from congrasp.common.transport import urls
 from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import process_name
 from congrasp.common.transport.ports import LEARNER_URL
-from congrasp.services.cli.arguments import option_value
+from congrasp.services.cli.arguments import has_option, option_value
 from congrasp.services.ops.lifetime import Stop, on_signal
-from congrasp.services.ops.logs import Watch, log
+from congrasp.services.ops.logs import MonitoringOptions, log
 from congrasp.services.ops.metrics import ActorMetrics
 from congrasp.services.ops.waiting import connect_when_up
 
@@ -40,6 +40,7 @@ class Actor:
     """`launch.json` of a run that `congrasp train` started, whose values for the actor --id are the
     defaults of the other options. `congrasp train` passes it to its processes.
     """
+    # `defaults` reads --launch before the command line is parsed
     connect: str = LEARNER_URL
     """Endpoint of the learner, such as tcp/10.0.0.5:7447."""
     run: str = "quickstart"
@@ -60,7 +61,7 @@ class Actor:
     references: pathlib.Path | None = None
     """File in which the actor stores the reference poses from the policy's grasps. At its next
     start it reads them from there."""
-    watch: Annotated[Watch, tyro.conf.arg(name="")] = Watch()  # noqa: RUF009
+    monitoring: Annotated[MonitoringOptions, tyro.conf.arg(name="")] = MonitoringOptions()  # noqa: RUF009
     """Monitoring."""
     certs: pathlib.Path | None = None
     """Folder of an actor's certificate (congrasp certs). The number of the certificate is the
@@ -69,8 +70,6 @@ class Actor:
 
     def __call__(self) -> int:
         """Acts until the run ends, or until a signal."""
-        from congrasp.common.runtime.stages import since_start
-
         if self.no_audit and self.audit is not None:
             raise CongraspError(
                 f"--audit {self.audit} contradicts --no-audit.", "Leave out one of them."
@@ -78,32 +77,37 @@ class Actor:
         importlib.import_module("congrasp.actors.process")  # takes seconds, so before it connects
         name = urls.name_on_wire(self.id or process_name("actor"), self.certs)
         metrics = ActorMetrics()
-        with self.watch.watched("actor", name, self.run, metrics), on_signal() as stop:
-            ready = since_start()
-            transport = connect_when_up(
-                self.connect,
-                "actor",
-                certs=self.certs,
-                run=self.run,
-                patience=self.patience,
-                stop=stop,
-            )
-            reason = "stopped"
-            if transport is not None:
-                with transport:
-                    log("info", f"Connected to the learner at {self.connect}.")
-                    reason = self._act(transport, name, metrics, stop, ready)
-            if stop.is_set():
+        monitor = self.monitoring.monitor("actor", name, self.run, metrics)
+        with monitor, on_signal() as stop:
+            reason = self._connect_and_act(name, metrics, stop)
+            if stop.is_set():  # a signal explains the end better
                 reason = stop.reason
             log("info", f"The actor ends: {reason}.")
             return stop.exit_code
 
-    def _act(
-        self, transport: Transport, name: str, metrics: ActorMetrics, stop: Stop, ready: float
-    ) -> str:
+    def _connect_and_act(self, name: str, metrics: ActorMetrics, stop: Stop) -> str:
+        """Waits for the learner, then acts; returns the reason of the end."""
+        from congrasp.common.runtime.stages import record_import_stage, since_start
+
+        imports_ended_s = since_start()
+        transport = connect_when_up(
+            self.connect,
+            "actor",
+            certs=self.certs,
+            run=self.run,
+            patience=self.patience,
+            stop=stop,
+        )
+        if transport is None:
+            return "stopped"
+        with transport:
+            log("info", f"Connected to the learner at {self.connect}.")
+            record_import_stage(imports_ended_s)
+            return self._act(transport, name, metrics, stop)
+
+    def _act(self, transport: Transport, name: str, metrics: ActorMetrics, stop: Stop) -> str:
         """Acts over a connected transport; returns the reason of the end."""
         from congrasp.actors.process import ActorOptions, run_actor
-        from congrasp.common.runtime.stages import imported
 
         def report(values: dict[str, float]) -> None:
             metrics.rollout(values)
@@ -113,7 +117,6 @@ class Actor:
                 values,
             )
 
-        imported(ready)
         options = ActorOptions(
             run=self.run,
             actor=name,
@@ -121,27 +124,31 @@ class Actor:
             threads=self.threads or cores(),
             patience=math.inf if self.patience is None else self.patience,
             on_rollout=report,
-            journal=None if self.no_audit else self._journal_of(name),
+            journal=None if self.no_audit else self._journal_opener(name),
             references=self.references,
         )
         return run_actor(transport, options, stop)
 
-    def _journal_of(self, name: str) -> "OpenJournal":
-        """Opens the journal named by --audit, or else that of the user's folder."""
+    def _journal_opener(self, name: str) -> "OpenJournal":
+        """Returns a function that opens the journal of a run id: the file named by --audit, or else
+        a journal in the user's folder.
+        """
 
-        def warn(text: str) -> None:
+        def report_failure(text: str) -> None:
             log("error", text)
 
-        def opened(run_id: str) -> Journal | None:
+        def open_journal(run_id: str) -> Journal | None:
             if self.audit is not None:
-                return Journal(self.audit, warn)
-            return user_journal(run_id, name, warn)
+                return Journal(self.audit, report_failure)
+            return user_journal(run_id, name, report_failure)
 
-        return opened
+        return open_journal
 
 
 def defaults(arguments: list[str]) -> dict[str, Any]:
-    """Defaults that depend on a command line: with --launch the values of that file."""
+    """Returns the values that replace the defaults of `Actor`'s fields if the command line has
+    --launch: the options of the actor --id in that file.
+    """
     launch_file = option_value("--launch", arguments)
     if not launch_file:
         return {}
@@ -160,6 +167,9 @@ def defaults(arguments: list[str]) -> dict[str, Any]:
         "references": references_file(run_dir, name),
         "certs": record.launch.certs,
     }
+    # A default must not contradict an option on the command line
+    if has_option("--audit", arguments) or has_option("--no-audit", arguments):
+        return values
     if record.launch.learner.audit:
         values["audit"] = run_dir / AUDIT / f"{name}.jsonl"
     else:

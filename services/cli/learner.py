@@ -16,7 +16,7 @@ from congrasp.common.transport.ports import LEARNER_URL, rank_url, reachable_url
 from congrasp.services.cli.arguments import option_value
 from congrasp.services.cli.train import defaults as defaults_of_preset
 from congrasp.services.ops.lifetime import Stop, command, on_signal
-from congrasp.services.ops.logs import Watch, log, log_error, logging_as
+from congrasp.services.ops.logs import MonitoringOptions, log, log_error, logging_as
 from congrasp.services.train.launch import LearnerOptions, read_launch
 from congrasp.services.train.presets import with_hand
 
@@ -105,7 +105,11 @@ class Options:
         return config
 
 
-def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:  # noqa: B008
+def learner(
+    options: Options,
+    config: RunConfig,
+    watch: MonitoringOptions = MonitoringOptions(),  # noqa: B008
+) -> int:
     """Run only the learner. Actors on this or other machines connect to it with `congrasp actor
     --connect`.
 
@@ -122,7 +126,7 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
       congrasp learner --run-dir runs/human --resume
     """
     from congrasp.common.named_inputs import COPY, OF_LEARNERS, check_inputs
-    from congrasp.common.runtime.stages import imported
+    from congrasp.common.runtime.stages import record_import_stage
     from congrasp.learner.distributed.ranks import Ranks, end_process
     from congrasp.learner.run_directory import listening
     from congrasp.services.train.learn import InnerActor, Monitoring, learn, longest_rollout
@@ -148,7 +152,7 @@ def learner(options: Options, config: RunConfig, watch: Watch = Watch()) -> int:
             ) as transport,
             contextlib.ExitStack() as stack,
         ):
-            imported()
+            record_import_stage()
             if rank == 0:
                 is_new = not options.resumes
                 before = Folder.of(run_dir)
@@ -231,7 +235,7 @@ def defaults(arguments: list[str]) -> dict[str, Any]:
     return {
         "options": options,
         "config": open_run(path.parent),
-        "watch": Watch(metrics_port=metrics_port),
+        "watch": MonitoringOptions(metrics_port=metrics_port),
     }
 
 

@@ -14,7 +14,7 @@ from congrasp.common.transport import urls
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import SERVER_URL
 from congrasp.services.ops.lifetime import Stop, on_signal
-from congrasp.services.ops.logs import Watch, announce_progress, log
+from congrasp.services.ops.logs import MonitoringOptions, announce_progress, log
 from congrasp.services.ops.metrics import ServerMetrics
 from congrasp.services.ops.waiting import connect_when_up, when_up
 
@@ -48,7 +48,7 @@ class Serve:
     """Endpoint for clients."""
     name: str = "policy"
     """Name under which clients find the policy."""
-    watch: Annotated[Watch, tyro.conf.arg(name="")] = Watch()  # noqa: RUF009
+    monitoring: Annotated[MonitoringOptions, tyro.conf.arg(name="")] = MonitoringOptions()  # noqa: RUF009
     """Monitoring."""
     certs: pathlib.Path | None = None
     """Folder of the server's certificate (congrasp certs), for connections to clients and to the
@@ -78,7 +78,7 @@ class Serve:
         jax.config.update("jax_cpu_enable_async_dispatch", False)  # ... and no handing over
         metrics = ServerMetrics()
         with (
-            self.watch.watched("server", self.name, self.run if self.connect else "", metrics),
+            self.monitoring.monitor("server", self.name, self.run if self.connect else "", metrics),
             starting,
             contextlib.ExitStack() as stack,
         ):

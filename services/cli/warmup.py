@@ -50,12 +50,12 @@ def warmup(
       congrasp warmup --preset human --export caches.tar
       congrasp warmup --import caches.tar
     """
-    from congrasp.common.runtime.stages import imported
+    from congrasp.common.runtime.stages import record_import_stage
     from congrasp.services.train.command import first_update
     from congrasp.services.train.learn import until_first_update
     from congrasp.services.train.presets import get_preset
 
-    imported()
+    record_import_stage()
     console = Console(highlight=False, soft_wrap=True)
     if source is not None and export is not None:
         raise CongraspError(

@@ -81,7 +81,7 @@ def logging_as(form: LogFormat, *, role: str, id: str, run: str) -> Iterator[Non
 
 
 @dataclasses.dataclass(frozen=True)
-class Watch:
+class MonitoringOptions:
     """Options for monitoring a role; the string under a field is its help on the command line."""
 
     log_format: LogFormat = "text"
@@ -92,7 +92,7 @@ class Watch:
     """Interface of the Prometheus endpoint. It has no authentication."""
 
     @contextlib.contextmanager
-    def watched(self, role: str, id: str, run: str, collector: Any) -> Iterator[None]:
+    def monitor(self, role: str, id: str, run: str, collector: Any) -> Iterator[None]:
         """Logs and, if a port is set, serves the collector's metrics while the block runs."""
         with logging_as(self.log_format, role=role, id=id, run=run), self.serve_metrics(collector):
             yield

@@ -21,7 +21,13 @@ from congrasp.common.named_inputs import identified
 from congrasp.common.objects.pool import HELD_OUT_SEED, load_pool
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle, policy_spec
-from congrasp.common.runtime.stages import Stage, imported, logged_stages, since_start, stages
+from congrasp.common.runtime.stages import (
+    Stage,
+    logged_stages,
+    record_import_stage,
+    since_start,
+    stages,
+)
 from congrasp.learner.algorithms import make_algorithm
 from congrasp.learner.checkpoint import Checkpoints
 from congrasp.learner.run_directory import (
@@ -39,7 +45,7 @@ from congrasp.learner.run_directory import (
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.evaluate.experiment import Experiment, Variation
 from congrasp.services.ops.lifetime import Stop, on_signal
-from congrasp.services.ops.logs import Watch
+from congrasp.services.ops.logs import MonitoringOptions
 from congrasp.services.serve.load import example_episode, one_answer, serve_policy
 from congrasp.services.train.launch import Launch, Plan
 from congrasp.services.train.learn import InnerActor, Monitoring, learn
@@ -85,7 +91,7 @@ def run_training(
       CongraspError: the arguments contradict each other, the configuration cannot run, another
         process trains in the folder, or a process failed permanently.
     """
-    imported()
+    record_import_stage()
     if run_dir is None:
         raise CongraspError("--resume needs the folder of a run.", _folders_to_resume())
     plan = launch.planned(config)
@@ -130,7 +136,7 @@ def _train(
                 on_update=progress.update,
                 on_event=_warn_of_error,
                 writers=plan.launch.learner.metric_writers,
-                watch=Watch(metrics_port=plan.launch.metrics_port),
+                watch=MonitoringOptions(metrics_port=plan.launch.metrics_port),
             ),
         )
         return

@@ -29,7 +29,7 @@ from congrasp.learner.distributed.ranks import ROUND_SECONDS, Ranks
 from congrasp.learner.process import Notify, Outputs, run_learner
 from congrasp.learner.run_directory import LOGS, create_run, has_checkpoints
 from congrasp.services.ops.lifetime import GRACE_S
-from congrasp.services.ops.logs import Watch
+from congrasp.services.ops.logs import MonitoringOptions
 from congrasp.services.ops.metrics import LearnerMetrics
 from congrasp.services.ops.status import ask
 from congrasp.services.record.run_recording import recorded
@@ -59,7 +59,7 @@ class Monitoring(NamedTuple):
     """See `learner.process.Outputs`."""
     writers: Sequence[MetricWriter] = ()
     """Metric writers of rank 0."""
-    watch: Watch = Watch()
+    watch: MonitoringOptions = MonitoringOptions()
     """Endpoint of the metrics."""
     audit: bool = True
     """Writes the journal, unless an actor inside keeps its rollouts on the device."""

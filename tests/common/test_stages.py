@@ -20,7 +20,7 @@ def names(stages):
 
 
 def test_stages_are_ordered_by_their_begin(stages):
-    stages.imported()
+    stages.record_import_stage()
     with stages.stage("outer"), stages.stage("inner"):
         time.sleep(0.02)
     assert names(stages) == ["imports", "outer", "inner"]
@@ -41,7 +41,7 @@ def test_a_repeated_stage_is_ignored(stages):
 
 def test_stages_are_logged_at_their_end(stages, caplog):
     caplog.set_level("INFO", "congrasp")
-    stages.imported()
+    stages.record_import_stage()
     with stages.stage("outer"), stages.stage("inner"):
         pass
     logged = [record.getMessage().split()[1] for record in caplog.records]
@@ -50,7 +50,7 @@ def test_stages_are_logged_at_their_end(stages, caplog):
 
 def test_long_work_of_jax_on_a_program_is_a_stage(stages, monkeypatch):
     monkeypatch.setattr(stages, "PROGRAM_SECONDS", 0.0)
-    stages.imported()
+    stages.record_import_stage()
     jax.jit(_program)(1.0)
     assert {"trace _program", "lower _program", "compile or read _program"} <= set(names(stages))
 

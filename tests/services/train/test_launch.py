@@ -86,6 +86,18 @@ def test_launched_actor_takes_options_of_file(tmp_path, audit):
     assert values["references"].parent == tmp_path / "references"
 
 
+@pytest.mark.parametrize("audit", [True, False])
+@pytest.mark.parametrize("option", ["--no-audit", "--audit=mine.jsonl"])
+def test_launched_actor_overrides_audit(tmp_path, audit, option):
+    record = make_record()
+    options = dataclasses.replace(record.launch.learner, audit=audit)
+    launch = dataclasses.replace(record.launch, learner=options)
+    path = write_launch(tmp_path, dataclasses.replace(record, launch=launch))
+    values = parsed(actor, "--launch", path, "--id", "actor-3", option)
+    assert values["no_audit"] is (option == "--no-audit")
+    assert values["audit"] == (None if option == "--no-audit" else pathlib.Path("mine.jsonl"))
+
+
 def edited(record: LaunchRecord, **changes: object) -> str:
     content = json.loads(json.dumps(dataclasses.asdict(record), default=str))
     return json.dumps({**content, **changes})
