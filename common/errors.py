@@ -26,6 +26,7 @@ class CongraspError(Exception):
     """Bad input or an environment error, described in one line.
 
     Attributes:
+      fault: the sentence about what is wrong, without the remedy.
       exit_code: exit code of the command line for this error.
       code: kind of the error on the wire, alongside the message; empty where a program cannot
         handle the kind.
@@ -35,6 +36,7 @@ class CongraspError(Exception):
     code = ""
 
     def __init__(self, what: str, remedy: str = ""):
+        self.fault = printable(what)
         text = printable(f"{what} {remedy}".strip())
         super().__init__(
             text if len(text) <= _LONGEST else f"{text[: _LONGEST - 400]} … {text[-300:]}"

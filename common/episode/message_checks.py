@@ -7,7 +7,7 @@ import numpy as np
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands import known_hand
-from congrasp.common.objects.object_checks import LARGEST
+from congrasp.common.objects.object_checks import MAX_COORDINATE
 from congrasp.common.wire.codec import Message
 from congrasp.common.wire.messages import EPISODE, validate
 
@@ -48,9 +48,9 @@ def _check_object(arrays: Mapping[str, np.ndarray], vertices: int) -> None:
     if ("colour_points" in arrays) != ("colour_values" in arrays):
         raise CongraspError("The episode has colour_points without colour_values, or the reverse.")
     for name in _POSITIONS:
-        if name in arrays and np.abs(arrays[name]).max() > LARGEST:
+        if name in arrays and np.abs(arrays[name]).max() > MAX_COORDINATE:
             raise CongraspError(
-                f"The episode's {name} are more than {LARGEST:g} m from the object's centre."
+                f"The episode's {name} are more than {MAX_COORDINATE:g} m from the object's centre."
             )
 
 

@@ -1,5 +1,6 @@
 """Objects as messages, with which files and digests are made."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,17 @@ _UNITS = (
     "m, kg, kg.m^2; quaternions (w, x, y, z); object frame with its origin at the centre of mass"
 )
 _NO_VERTICES = np.zeros((0, 3))
+_PIECE_COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "piece_kind": ("iu", ()),
+    "piece_part": ("iu", ()),
+    "piece_size": ("f", (3,)),
+    "piece_pos": ("f", (3,)),
+    "piece_quat": ("f", (4,)),
+    "piece_vertex_count": ("iu", ()),
+}
+"""Columns of a message with a row for each piece: codes of NumPy's kinds of dtypes, and the shape
+of a row.
+"""
 
 
 def object_to_message(obj: GraspObject) -> Message:
@@ -105,6 +117,7 @@ def object_from_message(message: Message) -> GraspObject:
 def _pieces(message: Message) -> tuple[Piece, ...]:
     """Returns the pieces of the columns in a message."""
     arrays = message.arrays
+    _check_columns(arrays)
     ends = np.cumsum(arrays["piece_vertex_count"])
     pieces = []
     for i, vertices in enumerate(np.split(arrays["piece_vertices"], ends[:-1])):
@@ -119,3 +132,21 @@ def _pieces(message: Message) -> tuple[Piece, ...]:
             )
         )
     return tuple(pieces)
+
+
+def _check_columns(arrays: Mapping[str, np.ndarray]) -> None:
+    """Raises a ValueError if the columns of the pieces do not belong together."""
+    pieces = len(arrays["piece_kind"])
+    for name, (kinds, row_shape) in _PIECE_COLUMNS.items():
+        column = arrays[name]
+        expected = (pieces, *row_shape)
+        if column.dtype.kind not in kinds:
+            raise ValueError(f"{name} has the invalid type {column.dtype}")
+        if column.shape != expected:
+            raise ValueError(f"{name} has the shape {column.shape}, not {expected}")
+    kind = arrays["piece_kind"]
+    if ((kind < 0) | (kind >= len(PIECE_KINDS))).any():
+        raise ValueError("piece_kind has a number without a kind")
+    vertex_counts = arrays["piece_vertex_count"]
+    if (vertex_counts < 0).any() or vertex_counts.sum() != len(arrays["piece_vertices"]):
+        raise ValueError("piece_vertex_count does not match the vertices")

@@ -17,6 +17,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.hands.files import hand_from_text, read_hand
 from congrasp.common.io.inputs import distinct_names, file_name, read_file, read_json, safe_name
 from congrasp.common.objects import store
+from congrasp.common.objects.object_message import object_to_message
 from congrasp.common.objects.procedural import generate
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file
@@ -238,13 +239,20 @@ def _with(values, index, value):
         (lambda o: {"pieces": o.pieces * 200}, "pieces"),
         (
             lambda o: {"pieces": (dataclasses.replace(o.pieces[0], size=(-1.0, 1.0, 1.0)),)},
-            "piece 0 has the size",
+            "piece 0 has the size .* not above 0 and at most 10 m",
         ),
         (
             lambda o: {"pieces": (dataclasses.replace(o.pieces[0], pos=(INF, 0.0, 0.0)),)},
             "numbers that are not finite",
         ),
+        (
+            lambda o: {"pieces": (dataclasses.replace(o.pieces[0], pos=(99.0, 0.0, 0.0)),)},
+            "piece 0 has the position .* more than 10 m from the origin",
+        ),
         (lambda o: {"file_scale": 0.0}, "file_scale"),
+        (lambda o: {"part_names": ("x" * 999,)}, "names of its parts are not texts of at most"),
+        (lambda o: {"points": o.points.astype(int)}, "points has the type int64"),
+        (lambda o: {"surface_error": -5.0}, "surface_error is -5.0, below 0 m"),
     ],
 )
 def test_objects_with_values_that_none_has_are_named(tmp_path, change, why):
@@ -254,6 +262,25 @@ def test_objects_with_values_that_none_has_are_named(tmp_path, change, why):
         store.load(tmp_path / "a.safetensors")
     assert str(tmp_path) in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "why"),
+    [
+        ("piece_size", lambda column: column[..., None], "piece_size has the shape"),
+        ("piece_quat", lambda column: column[:, :3], "piece_quat has the shape"),
+        ("piece_pos", lambda column: column.astype(bool), "piece_pos has the invalid type"),
+        ("piece_kind", lambda column: column * 0 - 1, "piece_kind has a number without a kind"),
+        ("piece_vertex_count", lambda column: column - 1, "does not match the vertices"),
+    ],
+)
+def test_an_object_with_invalid_pieces_is_named(tmp_path, name, change, why):
+    message = object_to_message(generate(0, "box"))
+    arrays = {**message.arrays, name: change(message.arrays[name])}
+    path = tmp_path / "a.safetensors"
+    path.write_bytes(encode(Message(arrays, message.meta)))
+    with pytest.raises(CongraspError, match=why):
+        store.load(path)
 
 
 @pytest.mark.parametrize(
