@@ -17,11 +17,11 @@ from congrasp.services.grasp.csv_paths import MAX_MAGNITUDE, NORM_TOLERANCE, rea
 
 MAX_CSV_BYTES = 32 << 20
 """Limit of the size of a CSV file."""
-_FROM_Y_UP = Rotation.from_euler("X", 90, degrees=True)
-"""From the frame of BVH files, whose y axis is up."""
+_Z_UP_FROM_Y_UP = Rotation.from_euler("x", 90, degrees=True)
+"""Takes vectors of a BVH file's world frame, whose y axis is up, to a frame whose z axis is up."""
 _BVH_UNIT = 0.01  # m
 _FRAME_S = 0.01
-"""Time between two frames of a CSV or NPZ file."""
+"""Time between two frames of a CSV or NPZ file. Times in a CSV file only have to be in order."""
 _AXES = {
     "+x": np.array([1.0, 0.0, 0.0]),
     "-x": np.array([-1.0, 0.0, 0.0]),
@@ -46,11 +46,17 @@ class WristPath(NamedTuple):
 def read_wrist_path(
     path: pathlib.Path, *, joint: str = "RightHand", fingers: str = "-y", back: str = "+z"
 ) -> WristPath:
-    """A wrist's path.
+    """Reads a wrist's path.
+
+    Formats:
+
+    * `.csv`: one line for each frame, with x, y, z in m and a quaternion w, x, y, z
+    * `.npz`: arrays `position` (T, 3) in m and `quaternion` (T, 4); or a motion file of `congrasp
+      grasp`, with `wrist_position` and `wrist_quaternion`
+    * `.bvh`: a skeleton in cm, whose y axis is up
 
     Args:
-      path: `.csv`, a line a frame: x, y, z (m) and a quaternion w, x, y, z; `.npz` with `position`
-        (T, 3) and `quaternion` (T, 4), or a grasp motion; or `.bvh`.
+      path: the file.
       joint: name of the wrist joint in a BVH file.
       fingers: axis of the file's wrist frame along which the fingers point, such as +x.
       back: axis of that frame towards the back of the hand.
@@ -62,15 +68,17 @@ def read_wrist_path(
     if not path.is_file():
         raise CongraspError(f"There is no file {path}.", "Pass a CSV, NPZ or BVH file.")
     recorded = _read(path, joint)
-    return recorded._replace(rotation=recorded.rotation * _hand_in_wrist(fingers, back))
+    return recorded._replace(rotation=recorded.rotation * _file_from_hand(fingers, back))
 
 
 def _read(path: pathlib.Path, joint: str) -> WristPath:
-    """The path in a file, with orientations of the file's own wrist frame."""
+    """Returns the path in a file, with orientations of the file's own wrist frame."""
     kind = path.suffix.lower()
     if kind == ".bvh":
         position, rotation, seconds = read_bvh(path, joint)
-        return WristPath(_FROM_Y_UP.apply(position * _BVH_UNIT), _FROM_Y_UP * rotation, seconds)
+        return WristPath(
+            _Z_UP_FROM_Y_UP.apply(position * _BVH_UNIT), _Z_UP_FROM_Y_UP * rotation, seconds
+        )
     if kind == ".csv":
         position, quaternion = read_csv(path, MAX_CSV_BYTES)
     elif kind == ".npz":
@@ -82,12 +90,20 @@ def _read(path: pathlib.Path, joint: str) -> WristPath:
     return WristPath(position, Rotation.from_quat(quaternion, scalar_first=True), _FRAME_S)
 
 
-def _hand_in_wrist(fingers: str, back: str) -> Rotation:
-    """Rotation of the hand's wrist frame to a file's, from the axes of fingers and back in it."""
+def _file_from_hand(fingers: str, back: str) -> Rotation:
+    """Returns the rotation that takes vectors of the hand's wrist frame to the file's wrist frame.
+
+    Args:
+      fingers: axis of the file's wrist frame that is the hand's -y.
+      back: axis of the file's wrist frame that is the hand's +z.
+
+    Raises:
+      CongraspError: an axis is unknown, or the axes are not orthogonal.
+    """
     for name in (fingers, back):
         if name not in _AXES:
             raise CongraspError(f"'{name}' is not an axis.", f"Choose from: {', '.join(_AXES)}.")
-    if _AXES[fingers] @ _AXES[back]:
+    if _AXES[fingers] @ _AXES[back] != 0.0:
         raise CongraspError(
             f"The axis {fingers} of the fingers and the axis {back} of the back of the hand are "
             "not perpendicular.",
@@ -99,11 +115,13 @@ def _hand_in_wrist(fingers: str, back: str) -> Rotation:
 
 
 def _read_npz(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (T, 3) and unit quaternions (T, 4) of an NPZ file."""
+    """Returns the positions (T, 3) and unit quaternions (T, 4) of an NPZ file."""
     remedy = "It needs 'position' and 'quaternion'."
     try:
         data = read_npz(path, remedy)
-        prefix = "wrist_" if "wrist_position" in data else ""
+        is_motion_file = "wrist_position" in data
+        prefix = "wrist_" if is_motion_file else ""
+        # Shapes and units in the notation of `check_arrays`
         meanings = {f"{prefix}position": "(T, 3) m", f"{prefix}quaternion": "(T, 4) w x y z"}
         check_arrays(data, meanings, indices=(), largest=MAX_MAGNITUDE)
     except (KeyError, ValueError) as error:

@@ -158,6 +158,15 @@ def test_a_zero_axis_of_inertia_gets_the_least_and_keeps_the_others(tmp_path):
     ]
 
 
+def test_a_third_moment_respects_products_of_inertia(tmp_path):
+    """The missing axis becomes a principal axis; the others keep their product."""
+    inertia = '<inertia ixx="3e-5" iyy="3e-5" izz="0" ixy="1e-5" ixz="1e-5"/>'
+    text = re.sub("<inertia [^>]*>", inertia, (PINCH / "pinch.urdf").read_text(), count=1)
+    (tmp_path / "hand.urdf").write_text(text)
+    _, model = robot_spec(tmp_path / "hand.urdf", [])
+    np.testing.assert_allclose(model.body("palm").inertia, [4e-5, 2.01e-5, 2e-5])
+
+
 def test_an_obj_of_points_is_a_hull(tmp_path):
     text = (PINCH / "pinch.urdf").read_text()
     (tmp_path / "hand.urdf").write_text(
