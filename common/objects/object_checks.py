@@ -87,7 +87,8 @@ def _number_faults(obj: GraspObject) -> Iterator[str]:
     if not (_is_number(obj.mass) and 0 < obj.mass <= _MAX_MASS):
         yield f"its mass is {_shown(obj.mass)}, not above 0 and at most {_MAX_MASS:g} kg"
     if not (_is_number(obj.file_scale) and 0 < obj.file_scale < _FILE_NUMBER_BOUND):
-        yield f"its file_scale is {_shown(obj.file_scale)}, not a number above 0"
+        bound = f"{_FILE_NUMBER_BOUND:g}"
+        yield f"its file_scale is {_shown(obj.file_scale)}, not above 0 and below {bound}"
     if len(obj.origin) != 3 or not all(map(_is_coordinate, obj.origin)):
         yield f"its origin is not three numbers below {_FILE_NUMBER_BOUND:g}"
     for name in ("surface_error", "volume_error"):
