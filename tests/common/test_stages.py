@@ -67,7 +67,7 @@ def test_a_failed_stage_is_recorded(stages):
 
 def test_stages_of_another_process_are_those_of_its_last_start(stages, caplog, tmp_path):
     caplog.set_level("INFO", "congrasp")
-    stages.imported(ended=3.0)
+    stages.record_import_stage(ended_s=3.0)
     lines = [record.getMessage() for record in caplog.records]
     lines.append("Start: programs took 2.0 s, until 6.0 s after the start of the process.")
     lines.append("Start: trace _advance took 0.5 s, until 5.0 s after the start of the process.")
