@@ -29,7 +29,7 @@ from congrasp.common.wire.codec import Message, decode, encode
 
 KEPT = 3
 """Number of checkpoints kept for a run."""
-_LATEST = "latest"
+_LATEST_LINK = "latest"
 _META = "meta"
 _PATTERN = "checkpoint_*.safetensors"
 _NUMBER = re.compile(r"checkpoint_(\d{1,15})\.safetensors")
@@ -71,8 +71,8 @@ class Checkpoints:
 
         Nothing depends on it, so that a failure leaves it as it is.
         """
-        latest = self._directory / _LATEST
-        link = self._directory / random_name(_LATEST)
+        latest = self._directory / _LATEST_LINK
+        link = self._directory / random_name(_LATEST_LINK)
         try:
             link.symlink_to(path.name)
             platforms.replace(link, latest)

@@ -222,7 +222,7 @@ def exclusive(
     path = run_dir / files.lock
     with contextlib.ExitStack() as stack:
         try:
-            held = stack.enter_context(_locked(path))
+            held = stack.enter_context(_open_locked(path))
         except NoLocksError:
             notify(f"{run_dir} is on a file system without locks: {files.claim} stands in for one.")
             claim = Claim(run_dir / files.claim)
@@ -237,7 +237,7 @@ def exclusive(
             except FileNotFoundError:
                 intact = False
             if not intact:
-                held = stack.enter_context(_locked(path))
+                held = stack.enter_context(_open_locked(path))
 
         yield check
 
@@ -253,7 +253,7 @@ def supervised(
         yield
 
 
-def _locked(path: pathlib.Path) -> BinaryIO:
+def _open_locked(path: pathlib.Path) -> BinaryIO:
     """The locked file of a run directory, see `exclusive`; closing it unlocks the directory."""
     with os_errors_as(f"{path} cannot be opened", "Choose another --run-dir."):
         file = open_to_update(path)

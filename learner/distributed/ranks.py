@@ -436,7 +436,7 @@ class Ending(NamedTuple):
     reason: str
 
 
-def ended_by(entries: Sequence[Mapping[str, Any] | None]) -> Ending | None:
+def first_ending(entries: Sequence[Mapping[str, Any] | None]) -> Ending | None:
     """Returns the end that the first rank requests; None if none does."""
     for rank, entry in enumerate(entries):
         if entry and entry.get("end"):

@@ -144,9 +144,9 @@ class LearnerHub:
         """Serves the run's keys from now on, and declares the learner alive."""
         transport = self._transport
         transport.serve(self.keys.config, self._on_config)
-        charging = self._rate_limit.charging
+        charged = self._rate_limit.wrap_handler
         transport.serve(
-            self.keys.tickets, charging(self._on_ticket), depth=64, admission=self._reject
+            self.keys.tickets, charged(self._on_ticket), depth=64, admission=self._reject
         )
         transport.serve(self.keys.status, lambda key, request: Message(meta=self.status()))
         transport.serve(
@@ -158,7 +158,7 @@ class LearnerHub:
         )
         transport.serve(
             self.keys.rollouts,
-            charging(self._on_rollout),
+            charged(self._on_rollout),
             workers=2,
             depth=8,
             on_damage=self._on_damage,

@@ -136,7 +136,7 @@ class StalenessManager:
     def capacity(self) -> int:
         """Number of tickets that could be granted now."""
         with self._lock:
-            return (self.max_staleness + self.version + 1) * self._batch - self._promised()
+            return (self.max_staleness + self.version + 1) * self._batch - self._count_promised()
 
     @property
     def required_version(self) -> int:
@@ -144,7 +144,7 @@ class StalenessManager:
         arrives before those of later tickets.
         """
         with self._lock:
-            used_at = max(0, self._promised() - 1) // self._batch
+            used_at = max(0, self._count_promised() - 1) // self._batch
             return min(self.version, used_at - self.max_staleness)
 
     def grant(self, owner: Owner, ticket_id: str) -> Ticket | None:
@@ -327,16 +327,16 @@ class StalenessManager:
         with self._lock:
             self._counters.undone = count
 
-    def _promised(self) -> int:
+    def _count_promised(self) -> int:
         """Number of rollouts that have been used, or are queued or awaited.
 
         Every version counts for one batch, so that a resumed run, or an update of another size,
         leaves no debt.
         """
         used = self.version * self._batch + self._in_update
-        return used + self.queued + self._awaited()
+        return used + self.queued + self._count_awaited()
 
-    def _awaited(self) -> int:
+    def _count_awaited(self) -> int:
         """Number of tickets that hold a place."""
         self._expire()
         now = self._clock()

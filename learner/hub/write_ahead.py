@@ -28,7 +28,7 @@ from congrasp.learner.checkpoint import set_aside
 
 FOLDER = "accepted"
 """Folder of a run directory with a folder for each rank."""
-PART = ".part"
+PART_SUFFIX = ".part"
 """Suffix of a file that is being written."""
 Identity = tuple[str, str, int]
 """Actor, incarnation and sequence."""
@@ -90,7 +90,7 @@ class WriteAheadLog:
         """
         self._saved = self._next = version
         recovered = Recovered([], [])
-        _remove(self._folder.glob(f"*{PART}"))  # never acknowledged
+        _remove(self._folder.glob(f"*{PART_SUFFIX}"))  # never acknowledged
         for path in sorted(self._folder.glob("*.safetensors")):
             if (name := _NAME.fullmatch(path.name)) is None:
                 continue
@@ -122,7 +122,7 @@ class WriteAheadLog:
             path = self._folder / f"{self._number:012d}~{'~'.join(map(str, identity))}.safetensors"
             try:
                 self._folder.mkdir(parents=True, exist_ok=True)
-                with temporary_file(path, PART) as (part, file):
+                with temporary_file(path, PART_SUFFIX) as (part, file):
                     file.write(encode(message))
                     file.close()
                     platforms.replace(part, path)
