@@ -37,7 +37,7 @@ _ASIDE = ".aside"
 
 
 class Checkpoints:
-    """Checkpoints of one run, the newest `KEPT` of which are kept."""
+    """The newest `KEPT` checkpoints of a run."""
 
     def __init__(self, directory: pathlib.Path):
         """Uses `directory`, which the first `save` creates."""
@@ -147,7 +147,7 @@ class Checkpoints:
 
 
 def set_aside(path: pathlib.Path) -> pathlib.Path:
-    """Renames a file so that it is not overwritten; returns its new name.
+    """Renames a file to an unused name, so that its content is not overwritten; returns the path.
 
     Raises:
       CongraspError: it cannot be renamed.

@@ -378,8 +378,11 @@ class _Learner:
             self._warm_up()
 
     def _run_update(self, began: float, pace: Pace) -> dict[str, float]:
-        """Runs one update; returns its metrics with the times since `began`, when the wait for its
-        batch began.
+        """Runs one update; returns its metrics and durations.
+
+        Args:
+          began: `time.monotonic()` at the start of the wait for the batch.
+          pace: measures the steps per second.
         """
         arrived = time.monotonic()
         values, steps = self._update()
@@ -441,8 +444,11 @@ class _Learner:
                 silent_since = time.monotonic()
 
     def _has_batch(self, posted: str, end: str) -> bool:
-        """True if this rank has a batch, which cannot disappear once a state was posted; waits a
-        moment for one unless training ends.
+        """True if this rank has a batch of rollouts; waits `_POLL_S` for one unless training ends.
+
+        Args:
+          posted: state that this rank has posted. Its batch cannot disappear after that.
+          end: reason of the end of training, or empty.
         """
         if posted:
             return True

@@ -201,8 +201,9 @@ class Ranks:
         *,
         urgent: bool = False,
     ) -> None:
-        """Posts this rank's entry (JSON) to the round; a second one replaces it, a late one is
-        ignored.
+        """Posts this rank's entry (JSON) to the round.
+
+        A second entry replaces the first. An entry after the end of the round is ignored.
         """
         frame = Message(arrays or {}, {"round": self._round, "urgent": urgent, "entry": entry})
         if self.rank == 0:

@@ -140,8 +140,9 @@ class StalenessManager:
 
     @property
     def required_version(self) -> int:
-        """Oldest policy with which the rollout of the latest ticket is fresh when it is used, if it
-        arrives before those of later tickets.
+        """Oldest version whose policy keeps the rollout of the latest ticket fresh until its use.
+
+        The rollout is assumed to arrive before the rollouts of later tickets.
         """
         with self._lock:
             used_at = max(0, self._count_promised() - 1) // self._batch
@@ -179,7 +180,7 @@ class StalenessManager:
             return (owner, ticket_id) in self._tickets
 
     def give_back(self, owner: Owner, ticket_id: str) -> None:
-        """Ends a ticket that its owner does not need; an unknown one is ignored."""
+        """Ends a ticket that its owner does not need; an unknown ticket is ignored."""
         with self._lock:
             if self._tickets.pop((owner, ticket_id), None):
                 self._counters.returned += 1

@@ -78,8 +78,8 @@ class AuditLog:
         self._journal.write(taken=taken, dropped=stale, spoilt=damaged)
 
     def record_unwritten(self, identities: Sequence[Identity]) -> None:
-        """Records rollouts that were accepted although the disk refused them: they do not survive
-        this session.
+        """Records accepted rollouts that could not be written to disk; a resume cannot recover
+        them.
         """
         self._journal.write(unwritten=identities)
 
@@ -128,8 +128,9 @@ def _is_entry(entry: dict[str, Any]) -> bool:
 
 
 def journalled_version(run_dir: pathlib.Path) -> int:
-    """Newest version that a run may have published, by its journals; -1 if there are none. A use
-    leads to one more.
+    """Newest version that a run may have published, by its journals; -1 without journals.
+
+    Rollouts used at a version lead to the next version.
     """
     versions = [-1]
     for path in sorted((run_dir / AUDIT).glob("learner-*.jsonl")):

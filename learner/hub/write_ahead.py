@@ -144,15 +144,18 @@ class WriteAheadLog:
         return False
 
     def begin_checkpoint(self, version: int) -> None:
-        """Records that a checkpoint of this version is about to be written; rollouts for a resume
-        from it are kept.
+        """Records that a checkpoint of this version is about to be written.
+
+        The rollouts for a resume from the checkpoint are kept.
         """
         with self._lock:
             self._next = version
 
     def cover(self, waiting: Iterable[Identity]) -> None:
-        """Records which rollouts the coming checkpoint covers: all stored ones except those still
-        queued.
+        """Records the rollouts that the coming checkpoint covers: those stored and not queued.
+
+        Args:
+          waiting: the queued rollouts.
         """
         with self._lock:
             self._decided = self._files.keys() - set(waiting)
@@ -181,7 +184,7 @@ def stored(run_dir: pathlib.Path) -> set[Identity] | None:
 
 
 def _remove(paths: Iterable[pathlib.Path]) -> None:
-    """Removes files; one that remains is ignored, or too old, when it is read again."""
+    """Removes files. A file that remains is ignored or too old when it is read again."""
     for path in paths:
         with contextlib.suppress(OSError):
             path.unlink(missing_ok=True)

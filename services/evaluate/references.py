@@ -249,9 +249,9 @@ def _count_grasps(regions: Sequence[_GraspsOfRegion]) -> int:
 def with_references(
     policy: PolicyBundle, task: TaskConfig, bank: ConstraintBank, grasps: list[list[list[Poses]]]
 ) -> References:
-    """Returns the bank with these grasps and trajectories to them, none of them both held out and
-    for training.
+    """Returns the bank with these grasps as references, and with trajectories to the grasps.
 
+    No reference is both held out and for training.
     A grasp counts if it clears the table in some resting pose. If there are too few, a fifth of
     them (at least one) is repeated among those held out, and the others among those for training.
     Where no grasp counts, the bank's poses that close the hand around the object are repeated
