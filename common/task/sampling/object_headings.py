@@ -29,7 +29,7 @@ class _Regions(NamedTuple):
     """Headings for the graspable region; None if it is out of reach."""
 
     def both(self) -> list[Headings]:
-        """Headings of V = 2 regions: the whole surface, and the graspable region if it has any."""
+        """Headings of V = 2 regions. The whole surface replaces a graspable region out of reach."""
         return [self.whole, self.graspable or self.whole]
 
 
