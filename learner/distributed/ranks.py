@@ -393,14 +393,15 @@ def accept_links(count: int, bind: str, port: int, deadline: float) -> dict[int,
             if hello.get("ranks") == count and hello.get("rank") in range(1, count):
                 links[hello["rank"]] = link
             else:
-                with contextlib.suppress(OSError):
-                    link.send(
-                        Message(
-                            meta={"lost": f"Rank 0 expects {count} ranks, and no {dict(hello)}"}
-                        )
-                    )
-                link.close()
+                _reject(link, f"Rank 0 expects {count} ranks, and no {dict(hello)}")
     return links
+
+
+def _reject(link: Link, reason: str) -> None:
+    """Sends the reason to the other end, and closes the link."""
+    with contextlib.suppress(OSError):
+        link.send(Message(meta={"lost": reason}))
+    link.close()
 
 
 def open_link(rank: int, count: int, host: str, port: int, deadline: float) -> Link:

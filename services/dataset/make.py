@@ -152,10 +152,7 @@ def make(
         for pool in prepared_pools:
             experiment = pool.experiment
             if pool.real_count:
-                if running:
-                    running.replace_objects(experiment.scaled, experiment.field)
-                else:
-                    running = stack.enter_context(experiment.simulator())
+                running = _simulator_for(experiment, running, stack)
             columns = grasp_columns(experiment.hand, experiment.task)
             counts: _Counts = collections.defaultdict(collections.Counter)
             chunks = [_no_rows(columns)]
@@ -174,6 +171,16 @@ def make(
                 object_columns(), object_rows(experiment.scaled[: pool.real_count]), about
             )
             shards.write(experiment.pool, grasps, objects)
+
+
+def _simulator_for(
+    experiment: Experiment, running: Episodes | None, stack: contextlib.ExitStack
+) -> Episodes:
+    """The simulator of all pools with the objects of one; opened in `stack` for the first pool."""
+    if running is None:
+        return stack.enter_context(experiment.simulator())
+    running.replace_objects(experiment.scaled, experiment.field)
+    return running
 
 
 def _no_rows(columns: Sequence[Column]) -> dict[str, np.ndarray]:
