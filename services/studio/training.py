@@ -382,12 +382,11 @@ def _is_read(topic: str) -> bool:
     return topic.startswith(_READ) or is_episode(topic)
 
 
-def opened_window(run: str, recordings: pathlib.Path | None) -> TrainingWindow:
-    """Returns the window on a run, which reads its recordings in the background: that takes seconds
-    for a long run.
+def open_window(run: str, recordings: pathlib.Path | None) -> TrainingWindow:
+    """Opens the window on a run; a thread reads the recordings, which takes seconds for a long run.
 
     Args:
-      run: name of the run; empty for that of the recordings' folder.
+      run: name of the run; empty for the name of the recordings' folder.
       recordings: recordings of the run, if there are any.
 
     Raises:
