@@ -122,12 +122,12 @@ class _FaceLayout(NamedTuple):
     corner_bytes: int
     count_offset: int
     """Bytes of a face before its number of corners."""
-    count: struct.Struct
+    count_form: struct.Struct
     """Type of the number of corners."""
 
     def corner_count(self, content: bytes, start: int) -> int:
         """Number of corners of the face that starts at a byte."""
-        (corners,) = self.count.unpack_from(content, start + self.count_offset)
+        (corners,) = self.count_form.unpack_from(content, start + self.count_offset)
         return corners
 
     def face_bytes(self, corners: int) -> int:
@@ -167,7 +167,7 @@ class _Body(NamedTuple):
             empty_bytes=empty_row.itemsize,
             corner_bytes=one_corner_row.itemsize - empty_row.itemsize,
             count_offset=count_offset,
-            count=struct.Struct(self.order + count_type.char),
+            count_form=struct.Struct(self.order + count_type.char),
         )
 
 
