@@ -228,8 +228,9 @@ class Attempts:
             self._worker.physics.close()
 
     def _new_worker(self, obj: GraspObject, batch: int) -> RolloutWorker:
-        """Returns a worker of `batch` environments on this object that acts with the mean and
-        traces all of them.
+        """Returns a worker of `batch` environments with an object.
+
+        The worker acts with the mean of the policy, and traces all environments.
 
         Raises:
           CongraspError: the engine is missing here, or cannot simulate the hand or other objects.

@@ -73,8 +73,10 @@ def _continue_episode(episode: TracedEpisode, trace: Trace) -> TracedEpisode:
 
 
 def _first_part(trace: Trace, before: EnvState | None, after: EnvState) -> TracedEpisode | None:
-    """Returns the part in a rollout of the episode at whose beginning it starts, or of the last one
-    that begins in it; None without one. See `Follower.add` for the arguments.
+    """Returns the first part of an episode that begins in a rollout; None if none begins.
+
+    If the rollout starts at the beginning of an episode, it is that episode, otherwise the last one
+    that begins in the rollout. See `Follower.add` for the arguments.
     """
     if before is not None:
         return _begin(before, trace, 0)

@@ -49,8 +49,9 @@ def collect(
     object_index: Array,
     region: Array,
 ) -> Grasps:
-    """Adds the grasps that succeeded in this step close to their heading, under constraints that
-    allow references.
+    """Adds the grasps that succeed in a control step.
+
+    They must be close to their heading, and under constraints that allow references.
 
     Args:
       scene: the control step.

@@ -216,7 +216,7 @@ class ActorLink(Closing):
 
     def _request_ahead(self) -> None:
         """Requests tickets in the background, if waiting for them would delay the next rollouts."""
-        ahead = self._pace.overlapping("ticket", _MAX_TICKETS_AHEAD)
+        ahead = self._pace.overlap_count("ticket", _MAX_TICKETS_AHEAD)
         while len(self._tickets_ahead) < ahead:
             request = functools.partial(self._request_ticket, _new_ticket_id(), _TICKET_TIMEOUT_S)
             self._tickets_ahead.append(_in_background(request))
@@ -255,13 +255,13 @@ class ActorLink(Closing):
             self._note(reply.meta)
             self._check()
             if reply.meta["granted"]:
-                return self._granted(ticket_id, reply)
+                return self._ticket_of(ticket_id, reply)
             delay = min(float(reply.meta["retry_after"]), deadline - self._patience.now())
             if delay <= 0:
                 return None
             self._wait_for_news(announced, delay)
 
-    def _granted(self, ticket_id: str, reply: Message) -> Ticket:
+    def _ticket_of(self, ticket_id: str, reply: Message) -> Ticket:
         """Returns a ticket, whose required version allows for the updates during a rollout."""
         version = int(reply.meta["version"])
         required = int(reply.meta.get("required_version", version))
@@ -280,8 +280,10 @@ class ActorLink(Closing):
             self._transport.query(self._ticket_key, request, timeout=self._timeout)
 
     def weights(self, newer_than: int, required: int | None = None) -> Message | None:
-        """Returns the latest policy bundle, or None if the caller need not change its policy: it
-        has the latest, or the learner is unreachable, or a later one is still on its way.
+        """Returns the latest policy bundle, or None if the caller keeps its policy.
+
+        That is the case if the caller has the latest policy, if the learner is unreachable, and
+        while a later policy is in transit.
 
         Sends no request unless the learner has announced another version.
 
@@ -332,7 +334,7 @@ class ActorLink(Closing):
             return True
         if required is None or self._held_version < required:
             return True
-        return not self._pace.overlapping("weights", 1)
+        return not self._pace.overlap_count("weights", 1)
 
     def _fetch_ahead(self) -> None:
         """Fetches the latest policy in the background, unless the caller has it or that is being
@@ -345,7 +347,12 @@ class ActorLink(Closing):
             self._weights_ahead = _in_background(fetch)
 
     def _fetch_weights(self, newer_than: int, held_session: str) -> "_Weights | None":
-        """Requests the latest policy bundle; None if it is that of version and session."""
+        """Requests the latest policy bundle; None if the caller has it, or on failure.
+
+        Args:
+          newer_than: version that the caller has.
+          held_session: session of that version.
+        """
         _, session = self._learner
         request = Message(meta={"newer_than": newer_than, "session_id": held_session})
         began = time.monotonic()
@@ -450,7 +457,7 @@ class ActorLink(Closing):
                 with self._news:
                     self._announced += 1
                     self._news.notify_all()
-                if self._pace.overlapping("weights", 1):
+                if self._pace.overlap_count("weights", 1):
                     self._fetch_ahead()
 
     def _ask(self, key: str, meta: dict[str, Any], deadline: float) -> Message:

@@ -26,7 +26,7 @@ class Pace:
             mean = self._seconds.get(what, seconds)
             self._seconds[what] = mean + _SMOOTHING * (seconds - mean)
 
-    def overlapping(self, what: str, most: int) -> int:
+    def overlap_count(self, what: str, most: int) -> int:
         """Returns the number of requests that must be under way so that none delays a rollout.
 
         That is the request's duration in rollouts, rounded up; 0 while the request takes a

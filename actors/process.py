@@ -93,29 +93,39 @@ def run_actor(transport: Transport, options: ActorOptions, stop: threading.Event
         the run names is missing here or has another content.
     """
     while not stop.is_set():
-        with ActorLink(
-            transport,
-            options.run,
-            options.actor,
-            patience=options.patience,
-            journal=options.journal,
-        ) as link:
-            try:
-                info = link.wait_for_config(stop)
-                if info is None:
-                    break
-                config = run_config_from_json(info.config)
-                check_inputs(config.inputs, OF_ACTORS, COPY)
-                actor = _Actor(options, config, info, link, transport)
-                actor.act(stop)
-                link.flush(_FLUSH_TIMEOUT_S)
-                break
-            except RunFinished:
-                link.flush(_FLUSH_TIMEOUT_S)
-                return COMPLETE
-            except RunRestarted:
-                continue
+        try:
+            return _act_until_restart(transport, options, stop)
+        except RunRestarted:
+            continue
     return STOPPED
+
+
+def _act_until_restart(transport: Transport, options: ActorOptions, stop: threading.Event) -> str:
+    """Acts for a learner process; see `run_actor`.
+
+    Raises:
+      RunRestarted: another process of the learner continues the run.
+    """
+    with ActorLink(
+        transport,
+        options.run,
+        options.actor,
+        patience=options.patience,
+        journal=options.journal,
+    ) as link:
+        try:
+            info = link.wait_for_config(stop)
+            if info is None:
+                return STOPPED
+            config = run_config_from_json(info.config)
+            check_inputs(config.inputs, OF_ACTORS, COPY)
+            actor = _Actor(options, config, info, link, transport)
+            actor.act(stop)
+            link.flush(_FLUSH_TIMEOUT_S)
+            return STOPPED
+        except RunFinished:
+            link.flush(_FLUSH_TIMEOUT_S)
+            return COMPLETE
 
 
 def first_environments(arrays: dict[str, Array], count: int) -> dict[str, np.ndarray]:

@@ -254,7 +254,7 @@ class Programs:
         """Returns the recorded values of trace and probe of a step."""
         scene = self.env.scene_of(state)
         probed = self._probe(scene, state.reset_state.object_index, settings.probe_data)
-        return _traced(scene, state.frame, action, transition, self._traced), probed
+        return _trace_of(scene, state.frame, action, transition, self._traced), probed
 
     def _advance(
         self,
@@ -372,7 +372,7 @@ def rollout_of(
     )
 
 
-def _traced(
+def _trace_of(
     scene: Scene, frame: Frame, action: Array, transition: Transition, where: int | slice
 ) -> Trace:
     """Recorded values of a step for one environment, or for several."""

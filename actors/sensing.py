@@ -70,8 +70,13 @@ def sense(sensing: Sensing, moment: Moment, newest: Action) -> Sensing:
 
 
 def targets_followed(task: TaskConfig, sensing: Sensing | None, newest: Action) -> Action:
-    """Returns the targets that the servos follow in a control step whose policy sets the `newest`
-    ones; they arrive `SensorParameters.latency` control steps late.
+    """Returns the targets that the servos follow in a control step.
+
+    Args:
+      task: the task.
+      sensing: state of the sensors; None without sensors.
+      newest: targets that the policy sets in this control step. They arrive
+        `SensorParameters.latency` control steps late.
     """
     if sensing is None or not task.sensing.latency[1]:
         return newest
@@ -84,8 +89,12 @@ def targets_followed(task: TaskConfig, sensing: Sensing | None, newest: Action) 
 
 
 def targets_last_followed(task: TaskConfig, sensing: Sensing | None, newest: Action) -> Action:
-    """Returns the targets that the servos followed in the last control step, whose policy set the
-    `newest` ones.
+    """Returns the targets that the servos followed in the last control step.
+
+    Args:
+      task: the task.
+      sensing: state of the sensors; None without sensors.
+      newest: targets that the policy set in the last control step.
     """
     if sensing is None or not task.sensing.latency[1]:
         return newest
@@ -93,7 +102,7 @@ def targets_last_followed(task: TaskConfig, sensing: Sensing | None, newest: Act
 
 
 def _late(sensing: Sensing, targets: Action) -> Action:
-    """Selects of targets (B, H, ...), newest first, those that have arrived."""
+    """Selects the targets that have arrived from targets (B, H, ...), newest first."""
     steps = sensing.parameters.latency[:, None, None]
     return Action(
         q_target=jnp.take_along_axis(targets.q_target, steps, 1)[:, 0],

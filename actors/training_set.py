@@ -52,8 +52,10 @@ class TrainingSet:
 
 
 def training_set(hand: Hand, config: RunConfig, number: int) -> TrainingSet:
-    """Returns procedural objects, those of a folder, or both, with procedural constraints or those
-    of constraint sets.
+    """Returns the objects of a run and their constraints.
+
+    The objects are procedural, from a folder, or both; the constraints are procedural, or from
+    constraint sets.
 
     Args:
       hand: the hand.

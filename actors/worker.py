@@ -11,7 +11,7 @@ from congrasp.actors import harvest
 from congrasp.actors.env_state import EnvState
 from congrasp.actors.harvest import Grasps
 from congrasp.actors.initial import InitialConditions
-from congrasp.actors.physics.engine import Physics
+from congrasp.actors.physics.engine import Physics, PhysicsState
 from congrasp.actors.rollout import (
     ActFunction,
     Probe,
@@ -287,12 +287,7 @@ class RolloutWorker:
             extras.append(recorded)
             decision = following
             if self._bank is not None and np.asarray(transition.terminal).any():
-                self._episode_key, episode_key = _split(self._episode_key)
-                state = self.programs.renew(
-                    self._bank, state, episode_key, self._stationary, transition.terminal
-                )
-                self.physics.reset(None, transition.terminal, state.reset_state)
-                physics_state = self.physics.read(None)
+                state, physics_state = self._renew(state, transition.terminal)
                 state_key = jax.random.wrap_key_data(key_data[step])
                 scene = self.programs.with_scene(state, physics_state)
                 decision = self.programs.decide(parameters, settings, scene, state_key)
@@ -302,6 +297,13 @@ class RolloutWorker:
             lambda *x: np.stack(x), *zip(rows, extras, strict=True)
         )
         return rollout_of(self.state, columns, decision.seen, trace, probed)
+
+    def _renew(self, state: EnvState, terminal: Array) -> tuple[EnvState, PhysicsState]:
+        """Starts another episode in the environments (B,) whose episode has ended."""
+        self._episode_key, key = _split(self._episode_key)
+        state = self.programs.renew(self._bank, state, key, self._stationary, terminal)
+        self.physics.reset(None, terminal, state.reset_state)
+        return state, self.physics.read(None)
 
     def _collect_compiled(self, parameters: Any, key: Array, steps: int) -> Rollout:
         """Collects a rollout as one program; see `collect`."""

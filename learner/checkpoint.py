@@ -29,7 +29,7 @@ from congrasp.common.wire.codec import Message, decode, encode
 
 KEPT = 3
 """Number of checkpoints kept for a run."""
-_LATEST = "latest"
+_LATEST_LINK = "latest"
 _META = "meta"
 _PATTERN = "checkpoint_*.safetensors"
 _NUMBER = re.compile(r"checkpoint_(\d{1,15})\.safetensors")
@@ -37,7 +37,7 @@ _ASIDE = ".aside"
 
 
 class Checkpoints:
-    """Checkpoints of one run, the newest `KEPT` of which are kept."""
+    """The newest `KEPT` checkpoints of a run."""
 
     def __init__(self, directory: pathlib.Path):
         """Uses `directory`, which the first `save` creates."""
@@ -71,8 +71,8 @@ class Checkpoints:
 
         Nothing depends on it, so that a failure leaves it as it is.
         """
-        latest = self._directory / _LATEST
-        link = self._directory / random_name(_LATEST)
+        latest = self._directory / _LATEST_LINK
+        link = self._directory / random_name(_LATEST_LINK)
         try:
             link.symlink_to(path.name)
             platforms.replace(link, latest)
@@ -147,7 +147,7 @@ class Checkpoints:
 
 
 def set_aside(path: pathlib.Path) -> pathlib.Path:
-    """Renames a file so that it is not overwritten; returns its new name.
+    """Renames a file to an unused name, so that its content is not overwritten; returns the path.
 
     Raises:
       CongraspError: it cannot be renamed.

@@ -38,7 +38,7 @@ from congrasp.learner.algorithms.protocol import (
     rollout_form,
 )
 from congrasp.learner.checkpoint import Checkpoints, checksum, flatten, restore
-from congrasp.learner.distributed.ranks import Ending, Ranks, ended_by
+from congrasp.learner.distributed.ranks import Ending, Ranks, first_ending
 from congrasp.learner.hub.admission import Admission
 from congrasp.learner.hub.hub import LearnerHub
 from congrasp.learner.hub.limits import Events
@@ -337,7 +337,7 @@ class _Learner:
             end = self._wait(stop, deaths)
             if end is not None:
                 break
-            values = self._timed_update(began, pace)
+            values = self._run_update(began, pace)
             self._report(values)
             self._check_collapse(watch, values)
             due = due or self._state.version % self._config.checkpoint_every == 0
@@ -377,9 +377,12 @@ class _Learner:
         if self._ranks.count == 1:
             self._warm_up()
 
-    def _timed_update(self, began: float, pace: Pace) -> dict[str, float]:
-        """Runs one update; returns its metrics with the times since `began`, when the wait for its
-        batch began.
+    def _run_update(self, began: float, pace: Pace) -> dict[str, float]:
+        """Runs one update; returns its metrics and durations.
+
+        Args:
+          began: `time.monotonic()` at the start of the wait for the batch.
+          pace: measures the steps per second.
         """
         arrived = time.monotonic()
         values, steps = self._update()
@@ -434,15 +437,18 @@ class _Learner:
             timeout = _POLL_S if posted else 0.0
             decision = self._ranks.poll(timeout)
             if decision is not None:
-                return ended_by(decision.meta["entries"])
+                return first_ending(decision.meta["entries"])
             if time.monotonic() - silent_since > _STALL_S:
                 of_other_rank = "of another rank " if posted else ""
                 self._event("warning", f"No batch of rollouts {of_other_rank}for {_STALL_S:.0f} s.")
                 silent_since = time.monotonic()
 
     def _has_batch(self, posted: str, end: str) -> bool:
-        """True if this rank has a batch, which cannot disappear once a state was posted; waits a
-        moment for one unless training ends.
+        """True if this rank has a batch of rollouts; waits `_POLL_S` for one unless training ends.
+
+        Args:
+          posted: state that this rank has posted. Its batch cannot disappear after that.
+          end: reason of the end of training, or empty.
         """
         if posted:
             return True

@@ -175,7 +175,7 @@ def check_config_unchanged(run_dir: pathlib.Path, kept: str) -> None:
 
 
 def _another_run(run_dir: pathlib.Path) -> str:
-    """Proposes another run, from the policy of this one if it has one."""
+    """Remedy: another run, which starts from the policy of this run if there is one."""
     policy = run_dir / POLICY_FILE
     if not policy.exists():
         return "start another run"
@@ -222,7 +222,7 @@ def exclusive(
     path = run_dir / files.lock
     with contextlib.ExitStack() as stack:
         try:
-            held = stack.enter_context(_locked(path))
+            held = stack.enter_context(_open_locked(path))
         except NoLocksError:
             notify(f"{run_dir} is on a file system without locks: {files.claim} stands in for one.")
             claim = Claim(run_dir / files.claim)
@@ -237,7 +237,7 @@ def exclusive(
             except FileNotFoundError:
                 intact = False
             if not intact:
-                held = stack.enter_context(_locked(path))
+                held = stack.enter_context(_open_locked(path))
 
         yield check
 
@@ -246,15 +246,17 @@ def exclusive(
 def supervised(
     run_dir: pathlib.Path, notify: Callable[[str], None] = lambda text: None
 ) -> Iterator[None]:
-    """Context that reserves a run directory for the process that starts and restarts its learner,
-    also while that does not run; raises like `exclusive`, whose arguments it has.
+    """Context that reserves a run directory for the process that starts and restarts its learner.
+
+    The directory is also reserved while the learner does not run. See `exclusive` for the
+    arguments and errors.
     """
     with exclusive(run_dir, notify, _LAUNCH_LOCK):
         yield
 
 
-def _locked(path: pathlib.Path) -> BinaryIO:
-    """The locked file of a run directory, see `exclusive`; closing it unlocks the directory."""
+def _open_locked(path: pathlib.Path) -> BinaryIO:
+    """Opens and locks a file of a run directory (`exclusive`); closing the file unlocks it."""
     with os_errors_as(f"{path} cannot be opened", "Choose another --run-dir."):
         file = open_to_update(path)
     with contextlib.ExitStack() as stack:

@@ -47,7 +47,7 @@ def kept_banks() -> Iterator[None]:
     folder = os.path.join(tempfile.gettempdir(), "congrasp-tests-banks")
     with (
         mock.patch.dict(os.environ, XDG_CACHE_HOME=folder),
-        mock.patch.object(cache, "LEAST_OBJECTS", 1),
+        mock.patch.object(cache, "MIN_OBJECTS", 1),
     ):
         yield
 

@@ -17,7 +17,7 @@ from congrasp.actors.physics.slots import (
     fill_body,
     fill_primitives,
     mesh_count,
-    restored,
+    restore_at_end,
     slot_model,
     stacked,
 )
@@ -57,8 +57,8 @@ class ObjectRows:
         self._dofs = first_dof + np.arange(6)
 
     def rows(self, objects: Sequence[GraspObject]) -> tuple[dict[str, np.ndarray], mujoco.MjModel]:
-        """Converts objects to rows of the fields that differ between them, and a model that holds
-        their meshes.
+        """Converts objects to rows of the fields in which objects differ, and to a model with their
+        meshes.
 
         Args:
           objects: N objects of primitive and mesh pieces in any mixture.
@@ -78,7 +78,7 @@ class ObjectRows:
         rows = []
         first_mesh = 0
         for obj in objects:
-            with restored(self.model, (*_SLOT_FIELDS, *BODY_FIELDS, *DOF_FIELDS)):
+            with restore_at_end(self.model, (*_SLOT_FIELDS, *BODY_FIELDS, *DOF_FIELDS)):
                 self.model.geom_dataid[self._mesh_geoms] = -1
                 fill_primitives(self.model, self._primitive_geoms, obj)
                 self._fill_meshes(meshes, first_mesh, mesh_count(obj))

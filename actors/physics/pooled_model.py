@@ -18,7 +18,7 @@ from congrasp.actors.physics.slots import (
     fill_body,
     fill_primitives,
     mesh_count,
-    restored,
+    restore_at_end,
     slot_model,
     stacked,
 )
@@ -69,7 +69,7 @@ class PooledModel:
         data = mujoco.MjData(self.model)
         rows = []
         for index, obj in enumerate(objects):
-            with restored(self.model, LEAVES):
+            with restore_at_end(self.model, LEAVES):
                 self._fill(data, obj, index)
                 rows.append({name: getattr(self.model, name).copy() for name in LEAVES})
         return stacked(rows)

@@ -36,8 +36,10 @@ _UNUSED_SIZE = 0.0004
 def slot_model(
     hand: Hand, task: TaskConfig, shared: GraspObject
 ) -> tuple[mujoco.MjModel, np.ndarray]:
-    """Compiles the model of a scene with an object whose fields others replace; and the geoms (S,)
-    of its pieces.
+    """Compiles the model of a scene for objects that replace the fields of a shared object.
+
+    Returns:
+      The model, and the geoms (S,) of the shared object's pieces.
     """
     spec = scene_spec(hand, task)
     body = add_object(
@@ -58,8 +60,8 @@ def empty_slots() -> list[Piece]:
 
 
 @contextlib.contextmanager
-def restored(model: mujoco.MjModel, names: Sequence[str]) -> Iterator[None]:
-    """Context at whose end these fields of a model are as before, also after an error."""
+def restore_at_end(model: mujoco.MjModel, names: Sequence[str]) -> Iterator[None]:
+    """Context at whose end the fields of a model are restored, also after an error."""
     before = {name: getattr(model, name).copy() for name in names}
     try:
         yield

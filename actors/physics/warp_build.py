@@ -68,21 +68,23 @@ def variants_of(device: wp.Device, launch_all: Callable[[], None]) -> list[Varia
     launch_tiled = wp.launch_tiled
     query = wp.get_suggested_block_size
 
-    def listed(make: Callable[..., None], kernel: wp.Kernel, *args: Any, **options: Any) -> None:
+    def record_launch(
+        make: Callable[..., None], kernel: wp.Kernel, *args: Any, **options: Any
+    ) -> None:
         if threading.get_ident() == this_thread:
             launched.append((kernel.module, options.get("block_dim") or _BLOCK))
         else:
             make(kernel, *args, **options)
 
-    def suggested(kernel: wp.Kernel, device: Any = None) -> tuple[int, int]:
+    def record_query(kernel: wp.Kernel, device: Any = None) -> tuple[int, int]:
         if threading.get_ident() != this_thread:
             return query(kernel, device)
         queried.append((kernel.module, kernel.module.options["block_dim"]))
         return 1, 1
 
-    wp.launch = functools.partial(listed, launch)
-    wp.launch_tiled = functools.partial(listed, launch_tiled)
-    wp.get_suggested_block_size = suggested
+    wp.launch = functools.partial(record_launch, launch)
+    wp.launch_tiled = functools.partial(record_launch, launch_tiled)
+    wp.get_suggested_block_size = record_query
     try:
         with wp.ScopedDevice(device):
             launch_all()
@@ -98,10 +100,10 @@ def variants_of(device: wp.Device, launch_all: Callable[[], None]) -> list[Varia
 
 @contextlib.contextmanager
 def one_builder(variants: Sequence[Variant]) -> Iterator[None]:
-    """Context that one process of this machine enters first: the others then read from Warp's cache
-    what it built.
+    """Context that one process of this machine enters first, to build the kernels.
 
-    They wait for `PATIENCE_S` seconds at most, and then build, too.
+    The other processes then read these kernels from Warp's cache. They wait for `PATIENCE_S`
+    seconds at most, and then build the kernels, too.
     """
     names = ",".join(sorted(f"{module.name} {size}" for module, size in variants))
     name = f"builder-{hashlib.sha256(names.encode()).hexdigest()[:16]}"

@@ -54,9 +54,9 @@ def _probabilities() -> list[_Setting]:
 
 
 def _with_outside_fields(settings: Iterable[_Setting]) -> Callable[[type[_Class]], type[_Class]]:
-    """Decorator that adds the settings that a class does not list, those of outside extensions."""
+    """Decorator that adds settings of outside extensions, which a class does not list."""
 
-    def extended(cls: type[_Class]) -> type[_Class]:
+    def extend(cls: type[_Class]) -> type[_Class]:
         for setting in settings:
             if setting.name in cls.__annotations__:
                 continue
@@ -64,7 +64,7 @@ def _with_outside_fields(settings: Iterable[_Setting]) -> Callable[[type[_Class]
             setattr(cls, setting.name, setting.default)
         return cls
 
-    return extended
+    return extend
 
 
 @dataclasses.dataclass(frozen=True)

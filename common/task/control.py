@@ -138,8 +138,9 @@ def wrist_lead(hand: Hand, control: ControlConfig, wrist: Guided, residual: Arra
 
 
 def carried_lead(hand: Hand, state: SceneState) -> Array:
-    """(B, 6) by which the wrist's target leads so that its servos carry the load, after the table
-    is removed.
+    """Lead (B, 6) of the wrist's target with which the servos carry the load, m and rad.
+
+    It is zero until the table is removed.
     """
     stiffness, _ = hand.wrist_servos
     return jnp.where(state.table[..., None], 0.0, -state.wrist_load / stiffness)

@@ -6,7 +6,7 @@ from congrasp.common.hands.spec import Hand
 from congrasp.common.runtime.lazy_jax import jax, jnp
 from congrasp.common.task.types import Array, SceneState
 
-FAR = 0.3
+NO_POINT_DISTANCE = 0.3
 """Distance that represents "no such surface point", m."""
 FORCE_SCALE = 5.0
 """Force at which the squashed force is one half, N."""

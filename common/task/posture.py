@@ -39,7 +39,7 @@ _MAX_DEVIATION_RAD = 1.0
 
 
 class FingerJoints(NamedTuple):
-    """Constants of a hand: which joints bend its G fingers; the thumb, which is first, has none."""
+    """Joints that bend the G fingers of a hand. The thumb is the first finger, without joints."""
 
     bends: np.ndarray
     """(G, F) bool: the joint bends the finger."""

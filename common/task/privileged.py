@@ -31,7 +31,7 @@ from congrasp.common.task.sensors.parameters import SensorParameters
 from congrasp.common.task.settings import GRAVITY, ControlConfig, TaskSettings
 from congrasp.common.task.types import Array
 
-MOST_LOAD = 10.0
+MAX_LOAD = 10.0
 """Upper bound of `load`."""
 _WRIST_ENDS = (6, 7, 13, 14, 20)
 """Ends of the wrist's numbers: the teacher's `Guided`, then the lead of the student's guidance
@@ -114,7 +114,7 @@ def observe(scene: Scene, parameters: Parameters) -> Array:
         parameters.mass,
         parameters.friction,
         parameters.gain_scale,
-        jnp.minimum(parameters.mass * GRAVITY / strength, MOST_LOAD),
+        jnp.minimum(parameters.mass * GRAVITY / strength, MAX_LOAD),
         parameters.stationary,
         jnp.maximum(remaining, 0) / max(task.hold_steps, task.hold_steps_max),
     ]

@@ -9,7 +9,7 @@ from congrasp.common import rotations
 from congrasp.common.hands.spec import Hand
 from congrasp.common.runtime.lazy_jax import jnp
 from congrasp.common.task.constraints import center_fingers, known, requested_fingers
-from congrasp.common.task.geometry import FAR, square
+from congrasp.common.task.geometry import NO_POINT_DISTANCE, square
 from congrasp.common.task.grip import resistance
 from congrasp.common.task.posture import finger_deviations
 from congrasp.common.task.scene import Scene
@@ -71,7 +71,7 @@ def _distance(scene: Scene, earning: Earning) -> Array:
     """Weighted distance from the keypoints to the surface."""
     distances = jnp.linalg.norm(scene.features.nearest, axis=-1)
     weights = keypoint_weights(scene.hand, center_fingers(scene.task, scene.goal))
-    return -jnp.sum(weights * jnp.minimum(distances, FAR), -1)
+    return -jnp.sum(weights * jnp.minimum(distances, NO_POINT_DISTANCE), -1)
 
 
 def _contact(scene: Scene, earning: Earning) -> Array:
@@ -214,9 +214,7 @@ GRASP: tuple[Term, ...] = (
 
 
 def terms(task: TaskSettings) -> tuple[str, ...]:
-    """Names of the terms, which are those of their weights: the grasp's, then those of the
-    constraints.
-    """
+    """Names of the terms and of their weights: the grasp's terms, then the constraints' terms."""
     names = [term.name for term in GRASP if term.value is not None]
     for constraint in known(task):
         names += [weight.name for weight in constraint.weights]

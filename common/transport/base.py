@@ -87,7 +87,7 @@ class Closing(Protocol):
     """A context that is closed at its end."""
 
     def close(self) -> None:
-        """Closes it and all that it declared; may be called repeatedly."""
+        """Closes the context and all of its declarations; may be called repeatedly."""
         ...
 
     def __enter__(self) -> Self:

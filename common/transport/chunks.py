@@ -123,8 +123,9 @@ class Outbox:
             yield self._cut(payload, requested if has_turn else _DEFAULT_CHUNK_BYTES)
 
     def _cut(self, payload: bytes, chunk_bytes: int) -> tuple[bytes, bytes | None]:
-        """Returns the first chunk of a reply and its attachment; stores the reply if that is not
-        all of it.
+        """Returns the first chunk of a reply, and the attachment with which a caller requests more.
+
+        A reply of several chunks is stored. The attachment of a single chunk is None.
         """
         if len(payload) <= chunk_bytes:
             return payload, None

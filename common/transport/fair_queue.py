@@ -82,7 +82,7 @@ class _Turns:
             del self._rotation[idle]
 
     def leave(self, name: str) -> None:
-        """Removes a name that lost its items without a turn; it stays in the rotation."""
+        """Forgets a newcomer that lost its items without a turn; the rotation is unchanged."""
         self._newcomers.pop(name, None)
 
 
@@ -111,11 +111,11 @@ class _Account(Generic[T]):
 
     @property
     def peers_with_single_item(self) -> int:
-        """Number of peers with exactly one item, which may wait for its answer."""
+        """Number of peers with exactly one item. Such a peer may be waiting for the answer."""
         return sum(len(entries) == 1 for entries in self._entries.values())
 
     def items(self) -> Iterator[T]:
-        """Yields all items, those of one peer together."""
+        """Yields all items, grouped by peer."""
         for entries in self._entries.values():
             for entry in entries:
                 yield entry.item
@@ -207,7 +207,7 @@ class FairQueue(Generic[T]):
         return self._length
 
     def __iter__(self) -> Iterator[T]:
-        """Yields all items, those of one peer together."""
+        """Yields all items, grouped by peer."""
         for account in self._accounts.values():
             yield from account.items()
 
@@ -223,8 +223,10 @@ class FairQueue(Generic[T]):
 
     @property
     def peers_ahead(self) -> int:
-        """Number of peers whose turn comes before those with a backlog: all peers of accounts that
-        have not had a turn, else the peers that have not had one, else those with a single item.
+        """Number of peers whose turn comes before the peers with a backlog.
+
+        These are the peers of accounts that have not had a turn; if there are none, the peers that
+        have not had a turn; and if there are none, the peers with a single item.
         """
         of_new_accounts = 0
         newcomers = 0
@@ -295,7 +297,7 @@ class FairQueue(Generic[T]):
         return self._accounts[peer.account].first(peer.name)
 
     def end_turn(self, peer: Peer) -> None:
-        """Puts a peer behind the others of its account, and its account behind the others."""
+        """Puts a peer behind the other peers of its account, and its account behind all others."""
         self._accounts[peer.account].end_turn(peer.name)
         self._turns.end(peer.account, self._accounts.__contains__)
 

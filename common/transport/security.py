@@ -151,8 +151,11 @@ class Credentials:
         return [common_name for common_name in names if common_name not in revoked]
 
     def settings(self, name: Flow, *, listens: bool) -> dict[str, Any]:
-        """Zenoh configuration of the session of one flow that listens or connects with these
-        credentials.
+        """Zenoh configuration of a session with these credentials.
+
+        Args:
+          name: flow of the session.
+          listens: True for a session that listens; False for one that connects.
         """
         side = "listen" if listens else "connect"
         tls = {
@@ -290,10 +293,10 @@ def check_exposure(endpoint: str, credentials: Credentials | None, *, insecure: 
 
 
 def refusal(endpoint: str, credentials: Credentials | None) -> CongraspError | None:
-    """Returns the error of a connection if its certificates cause it; takes one attempt of one or
-    two seconds.
+    """Returns the error of a connection that fails because of certificates; None for other causes.
 
-    Zenoh reports every failure in the same way: that it could not connect.
+    The attempt to connect takes one or two seconds. It is needed since Zenoh reports every failure
+    in the same way: that it could not connect.
     """
     match = _ENDPOINT.fullmatch(endpoint)
     if not match or not match["port"]:
@@ -420,7 +423,7 @@ def _access_control(listener: Identity, name: Flow, revoked: Set[str]) -> dict[s
         if named == Rights():
             continue
         for peer in peers:
-            allow(str(peer), [str(peer)], _filled(named, numbered(peer.number, "$*")))
+            allow(str(peer), [str(peer)], _fill_name(named, numbered(peer.number, "$*")))
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -470,7 +473,7 @@ def _split(rights: Rights) -> tuple[Rights, Rights]:
     return Rights(**shared), Rights(**named)
 
 
-def _filled(rights: Rights, name: str) -> Rights:
+def _fill_name(rights: Rights, name: str) -> Rights:
     """Replaces `{name}` in rights by a name."""
     filled: dict[str, tuple[str, ...]] = {}
     for kind, keys in dataclasses.asdict(rights).items():

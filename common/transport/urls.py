@@ -137,8 +137,9 @@ def find_credentials(certs: Certs, role: str, run: str | None = None) -> Credent
 
 
 def name_on_wire(name: str, certs: Certs, role: str = "actor") -> str:
-    """Name of an actor, server or client on the wire: it begins with its certificate's number, if
-    it has one.
+    """Name of an actor, server or client on the wire.
+
+    With a certificate, the name begins with the certificate's number.
     """
     credentials = find_credentials(certs, role)
     return name if credentials is None else numbered(credentials.identity.number, name)

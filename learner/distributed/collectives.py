@@ -22,11 +22,15 @@ REPLICATED = PartitionSpec()
 
 
 def shard(tree: Any, mesh: Mesh | None, specs: Any = REPLICATED) -> Any:
-    """Returns arrays over the whole mesh from this process's part; `specs` are those of
-    `jax.shard_map`.
+    """Returns arrays over the whole mesh.
 
-    Without a mesh they are committed to this process's device, since uncommitted ones would cause
-    recompilation.
+    Without a mesh the arrays are committed to this process's device, since uncommitted arrays would
+    cause recompilation.
+
+    Args:
+      tree: this process's part of the arrays.
+      mesh: mesh of all processes.
+      specs: partition specs, as in `jax.shard_map`.
     """
     if mesh is None:
         return jax.device_put(tree, jax.local_devices()[0])
@@ -54,8 +58,9 @@ def shard(tree: Any, mesh: Mesh | None, specs: Any = REPLICATED) -> Any:
 
 
 def shard_map(mesh: Mesh | None, program: Callable[..., Any], in_specs: Any) -> Callable[..., Any]:
-    """Returns a program that every process runs on its part, for `jax.jit`; results are the same on
-    all of them.
+    """Returns a program, for `jax.jit`, that every process runs on its part of the arguments.
+
+    The results are equal in all processes.
     """
     if mesh is None:
         return program
@@ -77,7 +82,10 @@ class Collectives:
         self._alone = mesh is None
 
     def mean(self, tree: Any) -> Any:
-        """Mean of every leaf, in one message for all of them, since latency dominates its cost."""
+        """Mean of every leaf over the processes.
+
+        All leaves are sent in one message, since latency dominates its cost.
+        """
         if self._alone:
             return tree
         flat, unravel = ravel_pytree(tree)

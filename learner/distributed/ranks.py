@@ -201,8 +201,9 @@ class Ranks:
         *,
         urgent: bool = False,
     ) -> None:
-        """Posts this rank's entry (JSON) to the round; a second one replaces it, a late one is
-        ignored.
+        """Posts this rank's entry (JSON) to the round.
+
+        A second entry replaces the first. An entry after the end of the round is ignored.
         """
         frame = Message(arrays or {}, {"round": self._round, "urgent": urgent, "entry": entry})
         if self.rank == 0:
@@ -392,14 +393,15 @@ def accept_links(count: int, bind: str, port: int, deadline: float) -> dict[int,
             if hello.get("ranks") == count and hello.get("rank") in range(1, count):
                 links[hello["rank"]] = link
             else:
-                with contextlib.suppress(OSError):
-                    link.send(
-                        Message(
-                            meta={"lost": f"Rank 0 expects {count} ranks, and no {dict(hello)}"}
-                        )
-                    )
-                link.close()
+                _reject(link, f"Rank 0 expects {count} ranks, and no {dict(hello)}")
     return links
+
+
+def _reject(link: Link, reason: str) -> None:
+    """Sends the reason to the other end, and closes the link."""
+    with contextlib.suppress(OSError):
+        link.send(Message(meta={"lost": reason}))
+    link.close()
 
 
 def open_link(rank: int, count: int, host: str, port: int, deadline: float) -> Link:
@@ -436,7 +438,7 @@ class Ending(NamedTuple):
     reason: str
 
 
-def ended_by(entries: Sequence[Mapping[str, Any] | None]) -> Ending | None:
+def first_ending(entries: Sequence[Mapping[str, Any] | None]) -> Ending | None:
     """Returns the end that the first rank requests; None if none does."""
     for rank, entry in enumerate(entries):
         if entry and entry.get("end"):

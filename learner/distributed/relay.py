@@ -44,8 +44,9 @@ def _accept(server: socket.socket, address: tuple[str, int]) -> None:
 
 
 def _forward(near: socket.socket, address: tuple[str, int]) -> None:
-    """Forwards one connection until this end closes it; the other end's closing is not passed
-    on.
+    """Forwards one connection until the near end closes it.
+
+    A far end that closes is not reported to the near end.
     """
     while True:
         with contextlib.suppress(OSError):

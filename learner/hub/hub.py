@@ -99,25 +99,22 @@ class LearnerHub:
             arrivals = list(self._arrivals)
             members = self._members.listed()
             unlisted = self._members.unlisted
-        span = _RATE_SECONDS
+        span_s = _RATE_SECONDS
         if arrivals:
             first, _, _ = arrivals[0]
-            span = min(span, max(1.0, now - first))
-        roles: list[dict[str, Any]] = []
-        arrived = collections.defaultdict[Owner, list[int]](list)
+            span_s = min(span_s, max(1.0, now - first))
+        steps_by_actor = collections.defaultdict[Owner, list[int]](list)
         for _, owner, steps in arrivals:
-            arrived[owner].append(steps)
-        for alive in members:
-            entry: dict[str, Any] = alive._asdict()
-            if alive.role == "actor":
-                owner = alive.id, alive.incarnation
-                decided = self._rollouts.decided(owner)
-                if decided is not None:
-                    entry |= {"rollouts": decided.rollouts, "version": decided.version}
-                    if decided.rollouts:
-                        entry["lag"] = self._staleness.lag(decided.version)
-                entry |= {**self._admission.counts(alive.id), **_rates(arrived[owner], span)}
-            roles.append(entry)
+            steps_by_actor[owner].append(steps)
+        roles: list[dict[str, Any]] = []
+        for member in members:
+            role: dict[str, Any] = member._asdict()
+            if member.role == "actor":
+                owner = member.id, member.incarnation
+                role |= self._progress_of(owner)
+                role |= self._admission.counts(member.id)
+                role |= _rates(steps_by_actor[owner], span_s)
+            roles.append(role)
         rollouts = self._rollouts.status()
         rejected = self._rate_limit.rejected + self._admission.rejected
         return {
@@ -128,18 +125,28 @@ class LearnerHub:
             "roles": roles,
             "unlisted": unlisted,
             "trouble": self.trouble,
-            "rates": _rates([steps for *_, steps in arrivals], span),
+            "rates": _rates([steps for *_, steps in arrivals], span_s),
             **rollouts,
             "counters": {**rollouts["counters"], "rejected": rejected},
         }
+
+    def _progress_of(self, owner: Owner) -> dict[str, int]:
+        """Number of decided rollouts of an actor, their latest version, and its lag."""
+        decided = self._rollouts.decided(owner)
+        if decided is None:
+            return {}
+        progress = {"rollouts": decided.rollouts, "version": decided.version}
+        if decided.rollouts:
+            progress["lag"] = self._staleness.lag(decided.version)
+        return progress
 
     def _serve(self) -> None:
         """Serves the run's keys from now on, and declares the learner alive."""
         transport = self._transport
         transport.serve(self.keys.config, self._on_config)
-        charging = self._rate_limit.charging
+        charged = self._rate_limit.wrap_handler
         transport.serve(
-            self.keys.tickets, charging(self._on_ticket), depth=64, admission=self._reject
+            self.keys.tickets, charged(self._on_ticket), depth=64, admission=self._reject
         )
         transport.serve(self.keys.status, lambda key, request: Message(meta=self.status()))
         transport.serve(
@@ -151,7 +158,7 @@ class LearnerHub:
         )
         transport.serve(
             self.keys.rollouts,
-            charging(self._on_rollout),
+            charged(self._on_rollout),
             workers=2,
             depth=8,
             on_damage=self._on_damage,

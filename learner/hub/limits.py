@@ -19,12 +19,12 @@ from congrasp.common.wire.codec import Message
 
 DAMAGED = 1 << 20
 """Bytes charged for a message that cannot be decoded."""
-_NAMES = 1024
-_LONGEST = 600.0  # longest backoff, s
+_MAX_CERTIFICATES = 1024
+_MAX_BACKOFF_S = 600.0
 _EVENT_SECONDS = 1.0  # between two events of one kind
-_EACH = 64
+_MAX_LISTED_TOKENS = 64
 """Most listed tokens of one role and certificate."""
-_LISTED = 1024
+_MAX_LISTED_MEMBERS = 1024
 """Most entries of one listing, whose reply must fit into a message."""
 
 
@@ -69,10 +69,10 @@ class RateLimit:
         with self._lock:
             self._levels[name] = self._level(name) - 1 - size / self._unit, self._clock()
             self._levels.move_to_end(name)
-            if len(self._levels) > _NAMES:
+            if len(self._levels) > _MAX_CERTIFICATES:
                 self._levels.popitem(last=False)
 
-    def charging(self, handler: Handler) -> Handler:
+    def wrap_handler(self, handler: Handler) -> Handler:
         """Wraps a handler of tickets or rollouts to charge for what it does not grant or accept."""
 
         def handle(key: str, request: Message) -> Message:
@@ -107,10 +107,10 @@ class PutOff:
         """Records an offence of an actor."""
         name = certificate(actor)
         count = self._known.get(name, (0, 0.0))[0] + 1
-        seconds = 0.0 if count == 1 else min(_LONGEST, 2.0 ** min(count - 2, 20))
+        seconds = 0.0 if count == 1 else min(_MAX_BACKOFF_S, 2.0 ** min(count - 2, 20))
         self._known[name] = count, self._clock() + seconds
         self._known.move_to_end(name)
-        if len(self._known) > _NAMES:
+        if len(self._known) > _MAX_CERTIFICATES:
             self._known.popitem(last=False)
 
     def forgive(self, actor: str) -> None:
@@ -183,7 +183,7 @@ class Members:
         """Records a token that appeared or disappeared; returns True if it is a listed one."""
         account = who.role, certificate(who.id)
         members = self._known[account]
-        if alive and (who in members or len(members) < _EACH):
+        if alive and (who in members or len(members) < _MAX_LISTED_TOKENS):
             members.add(who)
             return True
         if who in members:
@@ -200,10 +200,10 @@ class Members:
         """
         ranks = (enumerate(sorted(known)) for _, known in sorted(self._known.items()))
         first = sorted(itertools.chain.from_iterable(ranks), key=lambda ranked: ranked[0])
-        return sorted(who for _, who in first[:_LISTED])
+        return sorted(who for _, who in first[:_MAX_LISTED_MEMBERS])
 
     @property
     def unlisted(self) -> int:
         """Number of live tokens that are not listed."""
         members = sum(map(len, self._known.values()))
-        return sum(self._beyond.values()) + max(0, members - _LISTED)
+        return sum(self._beyond.values()) + max(0, members - _MAX_LISTED_MEMBERS)

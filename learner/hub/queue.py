@@ -67,7 +67,7 @@ class Sequences:
             self.refused.add(header.sequence)
         self.ahead.add(header.sequence)
         if len(self.ahead) > _WINDOW:
-            self.skipped += self._limited(min(self.ahead) - self.next)
+            self.skipped += self._limit_gap(min(self.ahead) - self.next)
             self.next = min(self.ahead)
         while self.next in self.ahead:
             self.ahead.remove(self.next)
@@ -79,9 +79,9 @@ class Sequences:
     def missing(self) -> int:
         """Number of undecided sequence numbers below the highest."""
         ahead = max(self.ahead, default=self.next - 1) + 1 - self.next - len(self.ahead)
-        return self.skipped + self._limited(ahead)
+        return self.skipped + self._limit_gap(ahead)
 
-    def _limited(self, gap: int) -> int:
+    def _limit_gap(self, gap: int) -> int:
         """Size of a gap in the sequence numbers, limited by tickets, since an actor may invent
         numbers.
         """
@@ -307,7 +307,7 @@ class RolloutQueue:
         messages = [message for _, message in batch]
         if self._audit is not None:
             lags = [self.staleness.lag(header.version) for header, _ in batch]
-            self._audit.used(self.staleness.version, lags, messages)
+            self._audit.record_uses(self.staleness.version, lags, messages)
         return messages
 
     def close(self) -> None:
@@ -358,13 +358,13 @@ class RolloutQueue:
         if self._log is not None:
             self._log.end_checkpoint()
         if self._audit is not None:
-            self._audit.saved(self.staleness.version)
+            self._audit.record_checkpoint(self.staleness.version)
 
     def discard(self, batch: Sequence[Message]) -> None:
         """Drops the rollouts of an unusable batch, so that no resume uses them."""
         identities = [(m.meta["actor"], m.meta["incarnation"], m.meta["sequence"]) for m in batch]
         if self._audit is not None:
-            self._audit.dropped(identities)
+            self._audit.record_dropped(identities)
         if self._log is not None:
             self._log.discard(identities)
 
@@ -376,7 +376,7 @@ class RolloutQueue:
             return True
         with self._changed:
             if self._audit is not None and not self._closed:
-                self._audit.unwritten([(*header.owner, header.sequence)])
+                self._audit.record_unwritten([(*header.owner, header.sequence)])
         return False
 
     def _take_up(self, recovered: Recovered) -> None:
@@ -399,7 +399,7 @@ class RolloutQueue:
                 sequences.add(header, accepted=False)
                 stale.append(identity)
         if self._audit is not None:
-            self._audit.recovered(taken, stale, recovered.damaged)
+            self._audit.record_recovered(taken, stale, recovered.damaged)
         if taken or stale:
             self._events.add(
                 "info",
@@ -463,7 +463,7 @@ class RolloutQueue:
         for header in stale:
             self.staleness.take(header.version)
         if self._audit is not None:
-            self._audit.dropped((*header.owner, header.sequence) for header in stale)
+            self._audit.record_dropped((*header.owner, header.sequence) for header in stale)
         actors = ", ".join(sorted({header.actor for header in stale}))
         self._events.add(
             "warning",

@@ -136,15 +136,16 @@ class StalenessManager:
     def capacity(self) -> int:
         """Number of tickets that could be granted now."""
         with self._lock:
-            return (self.max_staleness + self.version + 1) * self._batch - self._promised()
+            return (self.max_staleness + self.version + 1) * self._batch - self._count_promised()
 
     @property
     def required_version(self) -> int:
-        """Oldest policy with which the rollout of the latest ticket is fresh when it is used, if it
-        arrives before those of later tickets.
+        """Oldest version whose policy keeps the rollout of the latest ticket fresh until its use.
+
+        The rollout is assumed to arrive before the rollouts of later tickets.
         """
         with self._lock:
-            used_at = max(0, self._promised() - 1) // self._batch
+            used_at = max(0, self._count_promised() - 1) // self._batch
             return min(self.version, used_at - self.max_staleness)
 
     def grant(self, owner: Owner, ticket_id: str) -> Ticket | None:
@@ -179,7 +180,7 @@ class StalenessManager:
             return (owner, ticket_id) in self._tickets
 
     def give_back(self, owner: Owner, ticket_id: str) -> None:
-        """Ends a ticket that its owner does not need; an unknown one is ignored."""
+        """Ends a ticket that its owner does not need; an unknown ticket is ignored."""
         with self._lock:
             if self._tickets.pop((owner, ticket_id), None):
                 self._counters.returned += 1
@@ -327,16 +328,16 @@ class StalenessManager:
         with self._lock:
             self._counters.undone = count
 
-    def _promised(self) -> int:
+    def _count_promised(self) -> int:
         """Number of rollouts that have been used, or are queued or awaited.
 
         Every version counts for one batch, so that a resumed run, or an update of another size,
         leaves no debt.
         """
         used = self.version * self._batch + self._in_update
-        return used + self.queued + self._awaited()
+        return used + self.queued + self._count_awaited()
 
-    def _awaited(self) -> int:
+    def _count_awaited(self) -> int:
         """Number of tickets that hold a place."""
         self._expire()
         now = self._clock()

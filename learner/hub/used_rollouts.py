@@ -69,7 +69,7 @@ class AuditLog:
         )
         return len(replay(read_uses(self._path).intact)[1])
 
-    def recovered(
+    def record_recovered(
         self, taken: Sequence[Identity], stale: Sequence[Identity], damaged: Sequence[Identity]
     ) -> None:
         """Records rollouts of earlier sessions that are queued again, too old, or damaged on
@@ -77,17 +77,17 @@ class AuditLog:
         """
         self._journal.write(taken=taken, dropped=stale, spoilt=damaged)
 
-    def unwritten(self, identities: Sequence[Identity]) -> None:
-        """Records rollouts that were accepted although the disk refused them: they do not survive
-        this session.
+    def record_unwritten(self, identities: Sequence[Identity]) -> None:
+        """Records accepted rollouts that could not be written to disk; a resume cannot recover
+        them.
         """
         self._journal.write(unwritten=identities)
 
-    def saved(self, version: int) -> None:
+    def record_checkpoint(self, version: int) -> None:
         """Records a checkpoint of this version."""
         self._journal.write(saved=version)
 
-    def used(self, version: int, lags: Sequence[int], messages: Sequence[Message]) -> None:
+    def record_uses(self, version: int, lags: Sequence[int], messages: Sequence[Message]) -> None:
         """Records rollouts passed to the update that follows `version`."""
         rows = [
             [*_identity(message), lag, checksum(message)]
@@ -95,7 +95,7 @@ class AuditLog:
         ]
         self._journal.write(version=version, used=rows)
 
-    def dropped(self, identities: Iterable[Identity]) -> None:
+    def record_dropped(self, identities: Iterable[Identity]) -> None:
         """Records accepted rollouts that became too old."""
         self._journal.write(dropped=list(identities))
 
@@ -128,8 +128,9 @@ def _is_entry(entry: dict[str, Any]) -> bool:
 
 
 def journalled_version(run_dir: pathlib.Path) -> int:
-    """Newest version that a run may have published, by its journals; -1 if there are none. A use
-    leads to one more.
+    """Newest version that a run may have published, by its journals; -1 without journals.
+
+    Rollouts used at a version lead to the next version.
     """
     versions = [-1]
     for path in sorted((run_dir / AUDIT).glob("learner-*.jsonl")):

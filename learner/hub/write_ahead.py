@@ -28,7 +28,7 @@ from congrasp.learner.checkpoint import set_aside
 
 FOLDER = "accepted"
 """Folder of a run directory with a folder for each rank."""
-PART = ".part"
+PART_SUFFIX = ".part"
 """Suffix of a file that is being written."""
 Identity = tuple[str, str, int]
 """Actor, incarnation and sequence."""
@@ -90,7 +90,7 @@ class WriteAheadLog:
         """
         self._saved = self._next = version
         recovered = Recovered([], [])
-        _remove(self._folder.glob(f"*{PART}"))  # never acknowledged
+        _remove(self._folder.glob(f"*{PART_SUFFIX}"))  # never acknowledged
         for path in sorted(self._folder.glob("*.safetensors")):
             if (name := _NAME.fullmatch(path.name)) is None:
                 continue
@@ -122,7 +122,7 @@ class WriteAheadLog:
             path = self._folder / f"{self._number:012d}~{'~'.join(map(str, identity))}.safetensors"
             try:
                 self._folder.mkdir(parents=True, exist_ok=True)
-                with temporary_file(path, PART) as (part, file):
+                with temporary_file(path, PART_SUFFIX) as (part, file):
                     file.write(encode(message))
                     file.close()
                     platforms.replace(part, path)
@@ -144,15 +144,18 @@ class WriteAheadLog:
         return False
 
     def begin_checkpoint(self, version: int) -> None:
-        """Records that a checkpoint of this version is about to be written; rollouts for a resume
-        from it are kept.
+        """Records that a checkpoint of this version is about to be written.
+
+        The rollouts for a resume from the checkpoint are kept.
         """
         with self._lock:
             self._next = version
 
     def cover(self, waiting: Iterable[Identity]) -> None:
-        """Records which rollouts the coming checkpoint covers: all stored ones except those still
-        queued.
+        """Records the rollouts that the coming checkpoint covers: those stored and not queued.
+
+        Args:
+          waiting: the queued rollouts.
         """
         with self._lock:
             self._decided = self._files.keys() - set(waiting)
@@ -181,7 +184,7 @@ def stored(run_dir: pathlib.Path) -> set[Identity] | None:
 
 
 def _remove(paths: Iterable[pathlib.Path]) -> None:
-    """Removes files; one that remains is ignored, or too old, when it is read again."""
+    """Removes files. A file that remains is ignored or too old when it is read again."""
     for path in paths:
         with contextlib.suppress(OSError):
             path.unlink(missing_ok=True)

@@ -133,7 +133,7 @@ class View:
                 loaders = grasping.of_file(self.policy)
             if self.connect or self.recordings:
                 followed_run = self.run if self.connect else ""
-                window = training.opened_window(followed_run, self.recordings)
+                window = training.open_window(followed_run, self.recordings)
             if window is not None and self.connect:
                 observer = stack.enter_context(
                     urls.connect(self.connect, "observer", certs=self.certs)

@@ -34,7 +34,7 @@ from congrasp.services.dataset.columns import (
 )
 from congrasp.services.dataset.shards import Shards
 from congrasp.services.evaluate.episodes import Episodes
-from congrasp.services.evaluate.experiment import Experiment
+from congrasp.services.evaluate.experiment import Experiment, advance_from
 from congrasp.services.evaluate.plan import batches, plan_row
 from congrasp.services.evaluate.pools import PoolLoaders, PreparedPool, listed_pools, prepare_pools
 
@@ -151,33 +151,36 @@ def make(
         running: Episodes | None = None
         for pool in prepared_pools:
             experiment = pool.experiment
+            if pool.real_count:
+                running = _simulator_for(experiment, running, stack)
             columns = grasp_columns(experiment.hand, experiment.task)
             counts: _Counts = collections.defaultdict(collections.Counter)
-            parts = [_no_rows(columns)]
-            if pool.real_count:
-                if running:
-                    running.replace_objects(experiment.scaled, experiment.field)
-                else:
-                    running = stack.enter_context(experiment.simulator())
-
-                def report(episodes: int, before: int = done) -> None:
-                    """Reports the pool's episodes with those of earlier pools."""
-                    progress(before + episodes)
-
-                for rows in _episodes(running, pool, recipe.shares, report):
-                    parts.append(_counted(rows, recipe.keep, counts))
-                    done += len(rows["episode"])
+            chunks = [_no_rows(columns)]
+            report = functools.partial(advance_from, progress, done)
+            for rows in _episodes(running, pool, recipe.shares, report):
+                chunks.append(_count_and_filter(rows, recipe.keep, counts))
+                done += len(rows["episode"])
             about = {
                 **recipe.about,
                 "shard": experiment.pool,
                 "counts": counts,
                 "left_out": pool.left_out,
             }
-            grasps = table(columns, _joined(parts), about)
+            grasps = table(columns, _joined(chunks), about)
             objects = table(
                 object_columns(), object_rows(experiment.scaled[: pool.real_count]), about
             )
             shards.write(experiment.pool, grasps, objects)
+
+
+def _simulator_for(
+    experiment: Experiment, running: Episodes | None, stack: contextlib.ExitStack
+) -> Episodes:
+    """The simulator of all pools with the objects of one; opened in `stack` for the first pool."""
+    if running is None:
+        return stack.enter_context(experiment.simulator())
+    running.replace_objects(experiment.scaled, experiment.field)
+    return running
 
 
 def _no_rows(columns: Sequence[Column]) -> dict[str, np.ndarray]:
@@ -239,7 +242,7 @@ def _selected(tree: _T, rows: Any) -> _T:
 
 
 def _episodes(
-    running: Episodes,
+    running: Episodes | None,
     pool: PreparedPool,
     shares: Mapping[str, int],
     progress: Callable[[int], None],
@@ -248,11 +251,13 @@ def _episodes(
     any constraints.
 
     Args:
-      running: simulator of the pool's objects.
+      running: simulator of the pool's objects; None if no pool so far had objects.
       pool: the pool.
       shares: episodes of each object, by constraints.
       progress: called with the number of simulated episodes of the pool.
     """
+    if running is None or not pool.real_count:
+        return
     parts, columns = _initial_conditions(pool, shares)
     if not parts:
         return
@@ -277,7 +282,7 @@ def _episodes(
         yield {name: column[:count] for name, column in rows.items()}
 
 
-def _counted(
+def _count_and_filter(
     rows: Mapping[str, np.ndarray],
     keep: Sequence[str],
     counts: Mapping[str, collections.Counter[str]],

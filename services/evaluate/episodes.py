@@ -286,7 +286,7 @@ class Episodes:
     def _episode(
         self, begun: EnvState, trace: Trace, metrics: dict[str, float], index: int
     ) -> Episode:
-        """Returns one episode, from the initial state of all of them and its recording."""
+        """Returns one episode, from the initial states of all episodes and its own trace."""
         origin = {"version": self._bundle.version, "actor": "evaluation"}
         return traced_episode(
             self._hand,

@@ -34,7 +34,7 @@ class PolicyKey(NamedTuple):
 
 
 class Entrant(NamedTuple):
-    """A policy with its method; its task is that of the method."""
+    """A policy of a method, with the task of the method."""
 
     policy: PolicyBundle
     file: pathlib.Path

@@ -87,26 +87,17 @@ def evaluate_pools(
         episodes=episodes_of_object * pools.pool_size,
         measured=pools.pool_size * pool_count <= MAX_MEASURED_OBJECTS,
     )
-    files: list[pathlib.Path | None] = [None] * pool_count
-    if stored is not None:
-        name = experiment.digest(pools.source, pools.pool_size)
-        files = [stored / f"{name}-{i:05d}.safetensors" for i in range(pool_count)]
-    results = {}
-    for pool_index, file in enumerate(files):
-        message = None if file is None else read_kept(file)
-        if message is not None:
-            results[pool_index] = _result_of(message)
+    files = _result_files(experiment, pools, stored)
+    results = _stored_results(files)
     missing = [i for i in range(pool_count) if i not in results]
-    with contextlib.ExitStack() as stack, prepare_pools(experiment, pools, missing) as ready:
-        running: Episodes | None = None
-        for pool in ready:
-            if pool.real_count and not running:
-                running = stack.enter_context(pool.experiment.simulator())
+    with contextlib.ExitStack() as stack, prepare_pools(experiment, pools, missing) as prepared:
+        simulator: Episodes | None = None
+        for pool in prepared:
+            if pool.real_count and not simulator:
+                # One simulator for all pools, which have the same size.
+                simulator = stack.enter_context(pool.experiment.simulator())
             finished = sum(result.episodes for result in results.values())
-            progress = functools.partial(advance_from, advance, finished)
-            result = _simulate(running, pool, progress, max(0, MIN_STRESSED_EPISODES - finished))
-            if finished:  # forces are read from the first pool
-                result = result._replace(sample=result.sample.without_forces())
+            result = _simulate(simulator, pool, advance, finished)
             pool_index = pool.experiment.pool
             results[pool_index] = result
             file = files[pool_index]
@@ -115,22 +106,56 @@ def evaluate_pools(
     return _rows([results[i] for i in sorted(results)], experiment)
 
 
+def _result_files(
+    experiment: Experiment, pools: PoolLoaders, folder: pathlib.Path | None
+) -> list[pathlib.Path | None]:
+    """Files of the pools' results in a folder; None for each pool without a folder."""
+    pool_count = len(pools.loaders)
+    if folder is None:
+        return [None] * pool_count
+    name = experiment.digest(pools.source, pools.pool_size)
+    return [folder / f"{name}-{i:05d}.safetensors" for i in range(pool_count)]
+
+
+def _stored_results(files: Sequence[pathlib.Path | None]) -> dict[int, _Result]:
+    """Results in the files of an earlier evaluation, by the index of their pool."""
+    results = {}
+    for pool_index, file in enumerate(files):
+        message = None if file is None else read_kept(file)
+        if message is not None:
+            results[pool_index] = _result_of(message)
+    return results
+
+
 def _simulate(
-    running: Episodes | None, pool: PreparedPool, progress: Callable[[int], None], stressed: int
+    simulator: Episodes | None, pool: PreparedPool, advance: Callable[[int], None], finished: int
 ) -> _Result:
-    """Simulates the episodes of a pool, if it has objects."""
-    if not running or not pool.real_count:
+    """Simulates the episodes of a pool, if it has objects.
+
+    Args:
+      simulator: simulator of all pools; None if no pool so far had objects.
+      pool: pool of objects.
+      advance: called with the number of finished episodes of all pools.
+      finished: number of episodes that other pools have finished. If there are some, the forces of
+        this pool are dropped, since those of one pool suffice.
+    """
+    if not simulator or not pool.real_count:
         return _Result(Sample({}, np.zeros(0), np.zeros(0)), [], pool.left_out)
     experiment = pool.experiment
     row = Variation()
     plan = experiment.plan(row)
-    sample = experiment.sample(running, row, plan, progress, stressed=stressed)
+    progress = functools.partial(advance_from, advance, finished)
+    stressed = max(0, MIN_STRESSED_EPISODES - finished)
+    sample = experiment.sample(simulator, row, plan, progress, stressed=stressed)
     facts = []
     for obj in experiment.scaled[: pool.real_count]:
         largest_side = float(np.ptp(obj.visual_vertices, axis=0).max())
         facts.append(_ObjectFacts(obj.name, largest_side, float(obj.mass), obj.family))
-    not_padding = sample.values["object_index"] < pool.real_count
-    return _Result(sample.where(not_padding), facts, pool.left_out)
+    is_padding = sample.values["object_index"] >= pool.real_count
+    sample = sample.where(~is_padding)
+    if finished:
+        sample = sample.without_forces()
+    return _Result(sample, facts, pool.left_out)
 
 
 def _rows(results: Sequence[_Result], experiment: Experiment) -> list[Row]:
@@ -142,17 +167,8 @@ def _rows(results: Sequence[_Result], experiment: Experiment) -> list[Row]:
             "None of the objects can be approached.",
             "Scale the objects for the hand, or pass other objects.",
         )
-    first = 0
-    facts: list[_ObjectFacts] = []
-    for result in results:
-        result.sample.values["object_index"] = result.sample.values["object_index"] + first
-        first += len(result.objects)
-        facts += result.objects
-    sample = join_samples([result.sample for result in results])
-    index = sample.values["object_index"].astype(int)
-    sizes = np.array([obj.largest_side for obj in facts])
-    masses = np.array([obj.mass for obj in facts])
-    families = np.array([obj.family for obj in facts])
+    facts = list(itertools.chain.from_iterable(result.objects for result in results))
+    sample = _join(results)
     all_objects = RowDescription(
         Variation().constraint,
         experiment.hand.name,
@@ -162,12 +178,26 @@ def _rows(results: Sequence[_Result], experiment: Experiment) -> list[Row]:
         paper="objects",
     )
     rows = [summarise(all_objects, sample)]
-    for label, members in object_groups(sizes, masses, families):
-        chosen = members[index]
-        if chosen.any():
-            group = dataclasses.replace(all_objects, pool=int(members.sum()), group=label)
-            rows.append(summarise(group, sample.where(chosen)))
+    sizes = np.array([obj.largest_side for obj in facts])
+    masses = np.array([obj.mass for obj in facts])
+    families = np.array([obj.family for obj in facts])
+    object_index = sample.values["object_index"].astype(int)
+    for label, is_member in object_groups(sizes, masses, families):
+        in_group = is_member[object_index]
+        if in_group.any():
+            group = dataclasses.replace(all_objects, pool=int(is_member.sum()), group=label)
+            rows.append(summarise(group, sample.where(in_group)))
     return rows
+
+
+def _join(results: Sequence[_Result]) -> Sample:
+    """Joins the samples of pools; their object indices become those among all objects."""
+    first_object = 0
+    for result in results:
+        values = result.sample.values
+        values["object_index"] = values["object_index"] + first_object
+        first_object += len(result.objects)
+    return join_samples([result.sample for result in results])
 
 
 def _result_of(message: Message) -> _Result:

@@ -10,14 +10,13 @@ _TEMPLATE = pathlib.Path(__file__).with_suffix(".html")
 
 
 def motion_page(episode: Episode) -> str:
-    """Returns an HTML page on which the motion plays, and the mouse turns it. It needs no other
-    file.
+    """Returns a self-contained HTML page that plays the motion; the mouse turns the view.
 
     Args:
       episode: the motion of `congrasp.grasp`, or an episode of a recording.
 
     Raises:
-      CongraspError: jinja2 is not installed, or the episode is that of a motion file, which has no
+      CongraspError: jinja2 is not installed, or the episode is from a motion file, which has no
         hand.
     """
     page = template(_TEMPLATE).render(title=episode.object, motion=turntable(episode))

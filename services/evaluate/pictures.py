@@ -51,8 +51,8 @@ def cause(episode: Episode, drop_height: float) -> str:
 
 
 def fall_step(episode: Episode, drop_height: float) -> int:
-    """Step at which the object is `drop_height` (m) below its height at the table's removal, or the
-    last one.
+    """Step at which the object has fallen by `drop_height` (m) since the table's removal; the last
+    step if it has not.
 
     In a lift the height is relative to the wrist.
     """

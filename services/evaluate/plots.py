@@ -218,7 +218,7 @@ def _draw_table(table: Table) -> Any:
 
 
 def _draw_success(rows: Sequence[Row]) -> Any:
-    """Draws the success of each row with its interval, and that of the paper."""
+    """Draws the success rate of each row with its interval, and the paper's rate."""
     figure = new_figure(7.2, 0.9 + 0.36 * len(rows), "Success, with 95 % intervals")
     axes = figure.subplots()
     y = np.arange(len(rows))[::-1]

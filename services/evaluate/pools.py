@@ -166,15 +166,16 @@ def _divide(count: int, max_pool_size: int) -> tuple[int, int]:
 def prepare_pools(
     experiment: Experiment, pools: PoolLoaders, pool_indices: Sequence[int]
 ) -> Iterator[Iterator[PreparedPool]]:
-    """Context with an iterator over pools, each of which a thread prepares while the previous one
-    is in use.
+    """Context with an iterator over prepared pools.
+
+    A thread prepares the next pool while the caller uses the current one.
 
     Args:
       experiment: settings of the experiments.
       pools: all pools.
       pool_indices: indices of the pools to prepare.
     """
-    with _one_ahead(_prepare(experiment, pools, pool_indices)) as prepared:
+    with _prefetch(_prepare(experiment, pools, pool_indices)) as prepared:
         yield prepared
 
 
@@ -194,9 +195,10 @@ def _prepare(
 
 
 @contextlib.contextmanager
-def _one_ahead(items: Iterator[_Item]) -> Iterator[Iterator[_Item]]:
-    """Context with an iterator over the same items, each of which a thread computes while the
-    previous one is in use.
+def _prefetch(items: Iterator[_Item]) -> Iterator[Iterator[_Item]]:
+    """Context with an iterator over the same items.
+
+    A thread computes the next item while the caller uses the current one.
     """
 
     def next_item() -> _Item | None:

@@ -11,7 +11,7 @@ import hashlib
 import itertools
 import json
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import jax
@@ -196,36 +196,48 @@ def _grasp_all(
     hand = get_hand(policy.spec.hand)
     seeds = [int(store.digest(obj)[:8], 16) for obj in objects]
     object_seeds = np.array(seeds, np.uint32)
-    regions = []
-    for constraint in _REGIONS:
-        allowed = np.asarray(draws.samplable(task, bank, (constraint,)))
-        regions.append(
-            _GraspsOfRegion(
-                constraint,
-                [np.flatnonzero(row) for row in allowed],
-                np.zeros(len(objects), int),
-                [[] for _ in objects],
-            )
-        )
+    regions = [_start_region(constraint, task, bank) for constraint in _REGIONS]
     graspable = sum(region.count_graspable() for region in regions)
     most = POSES * graspable
     size = min(ENGINES[physics].batch, 1 << (most - 1).bit_length())
     with Episodes(
         policy, task, objects, hold=task.hold_steps, batch=size, physics=physics
     ) as episodes:
-        for region in regions:
-            while True:
-                attempts = region.next_attempts()
-                if not attempts.any():
-                    break
-                plan = region.plan(attempts, object_seeds)
-                for conditions, count in batches(hand, task, bank, plan, _SEED, size):
-                    episodes.run(conditions)
-                    region.add(jax.tree.map(np.asarray, episodes.take_grasps()), count)
-                    progress(_count_grasps(regions), most)
-                region.attempts[:] += attempts
+        for region, plan in _plans(regions, object_seeds):
+            for conditions, count in batches(hand, task, bank, plan, _SEED, size):
+                episodes.run(conditions)
+                region.add(jax.tree.map(np.asarray, episodes.take_grasps()), count)
+                progress(_count_grasps(regions), most)
     grasps_by_object = zip(*(region.grasps for region in regions), strict=True)
     return [list(of_regions) for of_regions in grasps_by_object]
+
+
+def _start_region(constraint: str, task: TaskConfig, bank: ConstraintBank) -> _GraspsOfRegion:
+    """Returns the region of a constraint, without grasps."""
+    is_samplable = np.asarray(draws.samplable(task, bank, (constraint,)))
+    object_count = len(is_samplable)
+    return _GraspsOfRegion(
+        constraint,
+        rests=[np.flatnonzero(row) for row in is_samplable],
+        attempts=np.zeros(object_count, int),
+        grasps=[[] for _ in range(object_count)],
+    )
+
+
+def _plans(
+    regions: Sequence[_GraspsOfRegion], object_seeds: np.ndarray
+) -> Iterator[tuple[_GraspsOfRegion, RowPlan]]:
+    """Yields episodes until each region has its grasps or has used its attempts.
+
+    The caller adds the grasps of a plan's episodes to its region before it takes the next plan,
+    which depends on them.
+    """
+    for region in regions:
+        attempts = region.next_attempts()
+        while attempts.any():
+            yield region, region.plan(attempts, object_seeds)
+            region.attempts[:] += attempts
+            attempts = region.next_attempts()
 
 
 def _count_grasps(regions: Sequence[_GraspsOfRegion]) -> int:
@@ -237,9 +249,9 @@ def _count_grasps(regions: Sequence[_GraspsOfRegion]) -> int:
 def with_references(
     policy: PolicyBundle, task: TaskConfig, bank: ConstraintBank, grasps: list[list[list[Poses]]]
 ) -> References:
-    """Returns the bank with these grasps and trajectories to them, none of them both held out and
-    for training.
+    """Returns the bank with these grasps as references, and with trajectories to the grasps.
 
+    No reference is both held out and for training.
     A grasp counts if it clears the table in some resting pose. If there are too few, a fifth of
     them (at least one) is repeated among those held out, and the others among those for training.
     Where no grasp counts, the bank's poses that close the hand around the object are repeated

@@ -11,7 +11,7 @@ import foxglove.layouts as fl
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import parse_json
-from congrasp.services.record.reader import log_files, metrics_of, read_records
+from congrasp.services.record.reader import Record, log_files, metrics_of, read_records
 from congrasp.services.record.writer import flatten
 
 CURVES = {
@@ -82,18 +82,23 @@ def _read_contents(recording: pathlib.Path) -> _Contents:
     contents = _Contents()
     for file in log_files(recording):
         for record in read_records(file, lambda topic: topic.startswith(_TOPIC_PREFIXES)):
-            kind, *levels = record.topic.strip("/").split("/")
-            if kind == "episode":
-                actor = levels[0]
-                fields = contents.signals.setdefault(actor, set())
-                if levels[1] == "signals":
-                    fields.update(flatten(parse_json(record.data, "A recording's signals")))
-            elif kind == "metrics":
-                names = contents.metrics.setdefault(record.topic, set())
-                names.update(flatten(metrics_of(record)["values"]))
-            elif not contents.event_topic:
-                contents.event_topic = record.topic
+            _add_topic(contents, record)
     return contents
+
+
+def _add_topic(contents: _Contents, record: Record) -> None:
+    """Adds the topic of a record and its fields to the contents."""
+    kind, *levels = record.topic.strip("/").split("/")
+    if kind == "episode":
+        actor = levels[0]
+        fields = contents.signals.setdefault(actor, set())
+        if levels[1] == "signals":
+            fields.update(flatten(parse_json(record.data, "A recording's signals")))
+    elif kind == "metrics":
+        names = contents.metrics.setdefault(record.topic, set())
+        names.update(flatten(metrics_of(record)["values"]))
+    elif not contents.event_topic:
+        contents.event_topic = record.topic
 
 
 def _episode_column(signals: dict[str, set[str]]) -> fl.SplitContainer:

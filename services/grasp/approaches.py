@@ -45,8 +45,8 @@ def to_attempt(
     Raises:
       CongraspError: no approach fits the request, or its reference path leads through the table.
     """
-    episodes = repeated(hand, task, obj, request, batch)
-    path = prescribed(request)
+    episodes = equal_episodes(hand, task, obj, request, batch)
+    path = prescribed_path(request)
     if path is None:
         position, direction, cross, rests = headings(hand, obj, request, batch, rng)
         goal = episodes.goal.replace(
@@ -64,12 +64,10 @@ def to_attempt(
     return episodes._replace(rest=np.asarray(obj.rest_poses, np.float32)[rests]), rests, distinct
 
 
-def repeated(
+def equal_episodes(
     hand: Hand, task: TaskConfig, obj: GraspObject, request: GraspRequest, batch: int
 ) -> RequestedEpisodes:
-    """Episodes of a request for a labelled object, `batch` equal ones in the requested resting
-    pose.
-    """
+    """Equal episodes of a request for a labelled object, in the requested resting pose."""
     rest = np.asarray(obj.rest_poses[request.rest or 0], np.float32)
     goal, surface, rest = jax.tree.map(
         lambda array: np.broadcast_to(array, (batch, *np.shape(array))),
@@ -112,7 +110,7 @@ def headings(
       CongraspError: no approach fits the request.
     """
     if request.avoid is not None:
-        obj = _balanced(obj)
+        obj = _balance_points(obj)
     candidates = _sampled_headings(hand, obj, request, rng)
     options = _with_room(hand, obj, request, candidates)
     if not options:
@@ -226,7 +224,7 @@ def _too_flat(hand: Hand, obj: GraspObject, rest: int) -> CongraspError:
     )
 
 
-def _balanced(obj: GraspObject) -> GraspObject:
+def _balance_points(obj: GraspObject) -> GraspObject:
     """The object with half of its surface points on the graspable region."""
     points, normals, _ = sample_union(obj.pieces, np.random.default_rng(0), DENSE)
     tree = cKDTree(np.hstack([obj.points, _ACROSS * obj.normals]))
@@ -279,7 +277,7 @@ def _no_room(obj: GraspObject, request: GraspRequest) -> tuple[str, str]:
     )
 
 
-def prescribed(request: GraspRequest) -> tuple[np.ndarray, np.ndarray] | None:
+def prescribed_path(request: GraspRequest) -> tuple[np.ndarray, np.ndarray] | None:
     """Wrist positions (n, 3) and last orientation (4,) that the strongest constraint prescribes;
     None if no constraint prescribes them.
     """

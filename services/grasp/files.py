@@ -54,8 +54,9 @@ def save_grasp(
     view: View | None = None,
     progress: Progress = ignore_progress,
 ) -> None:
-    """Writes a grasp; the result comes last, so that its presence means that all files are
-    complete.
+    """Writes a grasp.
+
+    The result is written last: if it exists, all files are complete.
 
     Args:
       folder: the object's folder.
@@ -64,7 +65,7 @@ def save_grasp(
       pictures: also writes the contact sheet, the portrait, the thumbnail and, with an arm, the
         arm's picture.
       about: further entries of the result.
-      view: viewpoint of pictures and video; the one that shows most of the grasp by default.
+      view: viewpoint of pictures and video; by default the viewpoint that shows most of the grasp.
       progress: called with the number of pictures and frames drawn.
 
     Raises:
@@ -83,8 +84,8 @@ def save_grasp(
     write_atomically(folder / RESULT, json.dumps(content, indent=2).encode())
 
 
-def finished(folder: pathlib.Path, key: str) -> dict[str, Any] | None:
-    """The stored result of an earlier grasp with the same key; None if there is none."""
+def read_result(folder: pathlib.Path, key: str) -> dict[str, Any] | None:
+    """Reads the result of an earlier grasp with the same key; None if there is none."""
     try:
         result = json.loads((folder / RESULT).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -95,8 +96,8 @@ def finished(folder: pathlib.Path, key: str) -> dict[str, Any] | None:
 
 
 def steps_to_draw(first: int, end: int, last: int) -> list[int]:
-    """Control steps of a contact sheet, in order: before a grasp, during it, after it, and the
-    last one.
+    """Control steps of a contact sheet, in order: before, during and after the grasp, and the last
+    step.
 
     Args:
       first: first step of the grasp itself.

@@ -27,7 +27,7 @@ from congrasp.common.task.constraints.priority import contradictions, explain
 from congrasp.common.wire.codec import encode
 from congrasp.services.arm.robot import Infeasible
 from congrasp.services.client.left_policy import mirrored_request
-from congrasp.services.grasp.approaches import prescribed, surface_of, to_attempt, with_avoid
+from congrasp.services.grasp.approaches import prescribed_path, surface_of, to_attempt, with_avoid
 from congrasp.services.grasp.costs import costs, rest_ranks
 from congrasp.services.grasp.motion import Grasp
 from congrasp.services.grasp.progress import Progress, ignore_progress
@@ -115,7 +115,7 @@ def limiting_cause(
         obj, mass=_LIGHTER * obj.mass, inertia=_LIGHTER * np.asarray(obj.inertia)
     )
     trials = [(lighter, "weight", f"a quarter of its {1000 * obj.mass:.0f} g")]
-    if prescribed(request) is None and request.given("heading", "position") is None:
+    if prescribed_path(request) is None and request.given("heading", "position") is None:
         smaller = obj.scaled(_SMALLER, constant_mass=True)
         trials.append((smaller, "width", f"{100 * _SMALLER:.0f} % of its size"))
     for changed, cause, change in trials:
@@ -281,7 +281,7 @@ class Grasper:
 
     def _may_retry(self, attempted: Attempted) -> bool:
         """True if another round is left, and would not repeat the same attempts."""
-        if prescribed(attempted.request) is not None:
+        if prescribed_path(attempted.request) is not None:
             return False
         return len(attempted.rounds) < self._rounds
 
@@ -334,7 +334,7 @@ class Grasper:
         return "Compiling"
 
     def _cost(self, attempts: Round) -> np.ndarray:
-        """(n,) cost of each attempt, with that of its resting pose."""
+        """(n,) cost of each attempt, including the cost of an unlikely resting pose."""
         removal = self.task.approach_steps - 1
         lift = self._attempts.phases.lift
         cost = costs(attempts.outcome, tuple(attempts.request.constraints), removal, lift)
@@ -350,7 +350,8 @@ class Grasper:
         return limiting_cause(obj, request, attempt)
 
     def _motion_on_arm(self, arm: "ArmPlanner", attempted: Attempted, progress: Progress) -> Grasp:
-        """Returns the best attempt that the arm can execute, of the first round that has one.
+        """Returns the best attempt that the arm can execute, from the first round with such an
+        attempt.
 
         Raises:
           CongraspError: the arm can execute no attempt that holds the object.
@@ -359,7 +360,7 @@ class Grasper:
         first = 0
         while True:
             for attempts in attempted.rounds[first:]:
-                grasp = self._planned(arm, attempts, attempted, refusals, progress)
+                grasp = self._plan_round(arm, attempts, attempted, refusals, progress)
                 if grasp is not None:
                     return grasp
             if not self._may_retry(attempted):
@@ -367,7 +368,7 @@ class Grasper:
             first = len(attempted.rounds)
             attempted = self._next_round(attempted, progress)
 
-    def _planned(
+    def _plan_round(
         self,
         arm: "ArmPlanner",
         attempts: Round,
@@ -375,8 +376,14 @@ class Grasper:
         refusals: collections.Counter[str],
         progress: Progress,
     ) -> Grasp | None:
-        """Returns the best attempt of a round that the arm can execute; `refusals` counts the
-        limits that exclude better ones.
+        """Returns the best attempt of a round that the arm can execute; None if there is none.
+
+        Args:
+          arm: planner of the arm.
+          attempts: the round.
+          attempted: all rounds.
+          refusals: counts the limits of the arm that exclude attempts.
+          progress: called for each attempt.
         """
         order = [i for i in self._cost(attempts).argsort().tolist() if attempts.meets[i]]
         for number, index in enumerate(order):

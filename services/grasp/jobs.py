@@ -23,7 +23,7 @@ from congrasp.services.assets.objects.masses import with_mass
 from congrasp.services.assets.objects.named import ObjectAt, located, objects_at
 from congrasp.services.assets.objects.options import ImportOptions, check_options
 from congrasp.services.assets.objects.sizes import size_in_words
-from congrasp.services.grasp.files import OBJECT, THUMBNAIL, finished, save_grasp
+from congrasp.services.grasp.files import OBJECT, THUMBNAIL, read_result, save_grasp
 from congrasp.services.grasp.grasper import Grasper
 from congrasp.services.grasp.keys import identity_of_constraints, identity_of_options, key_of
 from congrasp.services.grasp.motion import Grasp
@@ -75,7 +75,7 @@ class _Job(NamedTuple):
 def grasp_object(
     entry: ObjectAt, grasper: Grasper, settings: Settings, progress: Progress
 ) -> Result:
-    """Grasps one object and writes its folder, unless it is finished already."""
+    """Grasps one object and writes its folder, unless the folder is complete already."""
     try:
         job = _job(entry, grasper, settings)
         facts = _facts_before(job)
@@ -167,7 +167,7 @@ def _facts_before(job: _Job) -> dict[str, Any] | None:
     settings = job.settings
     if settings.again:
         return None
-    facts = finished(job.folder, job.key)
+    facts = read_result(job.folder, job.key)
     if facts is None:
         return None
     if settings.film is not None and facts.get("drawn") != json.loads(json.dumps(settings.drawn)):

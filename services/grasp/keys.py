@@ -43,7 +43,7 @@ def identity_of_constraints(constraints: Mapping[str, Any]) -> dict[str, list[st
 
 
 def identity_of_text(text: str) -> str:
-    """Identity of a constraint's text: the content of its file, if it names one.
+    """Identity of a constraint's text; for the name of a file, the file's content.
 
     FILE:PART, with a number or the name of a joint, is a file with a part.
     """

@@ -88,8 +88,9 @@ def _read(option: Option, text: str | tuple[str, ...], target: Target) -> Any:
 
 
 def _plain(option: Option, value: Any) -> str | tuple[str, ...]:
-    """Returns the text of an option, or its words if it takes several; a flag that is off is an
-    empty text.
+    """Returns the text of an option, or the words of an option that takes several.
+
+    A flag is "yes" if it is on, and empty if it is off.
     """
     if option.switch or value is None:
         return "yes" if value else ""

@@ -269,8 +269,14 @@ def _at(field: DistanceField, points: np.ndarray) -> jax.Array:
 
 
 def _duration(curve: _Curve, seconds: float, speed: float) -> float:
-    """Duration of the curve in s: as requested, or the shortest one tried in which the wrist keeps
-    to its limits.
+    """Duration of a curve in s at which the wrist keeps to its limits.
+
+    It is the requested duration, or else the shortest of the longer ones that are tried.
+
+    Args:
+      curve: the curve.
+      seconds: requested duration.
+      speed: speed of the wrist at the end, m/s.
     """
     x = np.linspace(0, 1, _FINE)
     for duration in seconds * np.geomspace(1.0, _MAX_STRETCH, 100):

@@ -16,11 +16,11 @@ class Result(NamedTuple):
     """Content of the result file; empty if there is an error."""
     error: str = ""
     skipped: bool = False
-    """It was finished before."""
+    """True if the folder was complete before."""
 
     @property
     def held(self) -> bool:
-        """True if the object is held, and its shape is close to that of its file."""
+        """True if the object is held, and its simulated shape is close to the shape in its file."""
         return bool(self.facts.get("success")) and self.facts["shape_reliable"]
 
     def line(self) -> str:

@@ -9,11 +9,11 @@ from typing import Protocol
 from congrasp.common.errors import CongraspError
 from congrasp.services.studio.routes import Routes
 
-MOST = 16
+MAX_SESSIONS = 16
 """Maximum number of browsers; a further one ends the session that was used least recently, if it is
 idle.
 """
-IDLE = 1800.0
+IDLE_S = 1800.0
 """Seconds without a request after which a session is idle."""
 
 
@@ -23,7 +23,7 @@ class Session(Protocol):
     routes: Routes
 
     def close(self) -> None:
-        """Ends it."""
+        """Ends the session."""
 
 
 class Sessions:
@@ -52,12 +52,12 @@ class Sessions:
         with self._lock:
             now = time.monotonic()
             session, _ = self._open.pop(browser, (None, now))
-            if session is None and len(self._open) >= MOST:
+            if session is None and len(self._open) >= MAX_SESSIONS:
                 oldest, used = next(iter(self._open.values()))
-                if now - used < IDLE:
+                if now - used < IDLE_S:
                     raise CongraspError(
-                        f"{MOST} browsers, the maximum, use this studio.",
-                        f"Try again after one of them has been idle for {IDLE / 60:.0f} minutes, "
+                        f"{MAX_SESSIONS} browsers, the maximum, use this studio.",
+                        f"Try again after one of them has been idle for {IDLE_S / 60:.0f} minutes, "
                         f"or start another studio.",
                     )
                 self._open.popitem(last=False)

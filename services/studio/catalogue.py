@@ -78,7 +78,7 @@ class Catalogue:
         return self._objects[name]
 
 
-def offered(folder: pathlib.Path | None) -> Catalogue:
+def open_catalogue(folder: pathlib.Path | None) -> Catalogue:
     """The user's objects, then one of each procedural family; none is made or imported yet.
 
     Raises:

@@ -27,7 +27,7 @@ from congrasp.common.task.constraints import get_constraint, known, require_know
 from congrasp.common.task.constraints.priority import explain
 from congrasp.common.transport.base import Transport
 from congrasp.services.evaluate.pictures import cause
-from congrasp.services.grasp.approaches import repeated, surface_of
+from congrasp.services.grasp.approaches import equal_episodes, surface_of
 from congrasp.services.grasp.costs import costs
 from congrasp.services.grasp.reach import with_planned_reach
 from congrasp.services.serve.sources import Source, follow_file, follow_run
@@ -204,7 +204,7 @@ def varied_episodes(
     of each from the drawn grasp, m.
     """
     rng = np.random.default_rng(0)
-    drawn = repeated(hand, task, obj, request, ATTEMPTS)
+    drawn = equal_episodes(hand, task, obj, request, ATTEMPTS)
     goal = drawn.goal
     is_variation = np.arange(ATTEMPTS) > 0
     shift = rng.normal(0.0, _SHIFT_SIGMA_M, (ATTEMPTS, 3)) * is_variation[:, None]

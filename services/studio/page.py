@@ -50,7 +50,7 @@ MEANINGS = {term.name: term.meaning for term in GRASP}
 MEANINGS |= {weight.name: weight.meaning for weight in _CONSTRAINT_WEIGHTS}
 """Descriptions of the reward terms by name."""
 _ABOVE = np.cos(np.radians(45.0))
-MOST = 30
+MAX_MOTIONS = 30
 """Number of motions kept; the oldest is dropped first."""
 DATA = ("npz", "mcap", *FORMATS)
 """Formats in which a motion is saved without a job."""
@@ -317,7 +317,7 @@ class Motions:
         """Keeps a motion; returns its number."""
         self._number += 1
         self._episodes[str(self._number)] = episode
-        while len(self._episodes) > MOST:
+        while len(self._episodes) > MAX_MOTIONS:
             del self._episodes[next(iter(self._episodes))]
         return str(self._number)
 
@@ -336,10 +336,10 @@ class Motions:
 
     def view(self) -> list[dict[str, Any]]:
         """List entries of the motions, the newest first."""
-        return [_described(key, episode) for key, episode in reversed(self._episodes.items())]
+        return [_list_entry(key, episode) for key, episode in reversed(self._episodes.items())]
 
 
-def _asked(episode: Episode) -> str:
+def _request_in_words(episode: Episode) -> str:
     """Request of a motion in words: its constraints, and the direction of the approach, world
     frame.
     """
@@ -355,13 +355,13 @@ def _asked(episode: Episode) -> str:
     return ", ".join([*titles, approach])
 
 
-def _described(key: str, episode: Episode) -> dict[str, Any]:
+def _list_entry(key: str, episode: Episode) -> dict[str, Any]:
     """List entry of a motion."""
     metrics = episode.metrics
     return {
         "id": key,
         "object": episode.object,
-        "asked": _asked(episode),
+        "asked": _request_in_words(episode),
         "success": episode.success,
         "held": metrics.get("held", 0.0) > 0,
         "note": episode.about.get("note", ""),

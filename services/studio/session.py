@@ -22,7 +22,13 @@ from congrasp.services.assets.objects.masses import with_mass
 from congrasp.services.assets.objects.materials import MATERIALS
 from congrasp.services.assets.objects.units import METRES
 from congrasp.services.studio.browser_sessions import Sessions
-from congrasp.services.studio.catalogue import Catalogue, Importer, Thumbnails, Uploads, offered
+from congrasp.services.studio.catalogue import (
+    Catalogue,
+    Importer,
+    Thumbnails,
+    Uploads,
+    open_catalogue,
+)
 from congrasp.services.studio.grasping import Loaders, PolicyGrasping, Progress
 from congrasp.services.studio.jobs import Jobs
 from congrasp.services.studio.page import (
@@ -434,7 +440,7 @@ def open_page(
 
     Args:
       hands: loaders of policies, by name; all browsers share their programs.
-      objects: the user's objects, before the procedural ones (see `catalogue.offered`).
+      objects: the user's objects, before the procedural ones (see `catalogue.open_catalogue`).
       window: state of a run, or None.
       host: see `PageServer`, also for `port` and `names`.
 
@@ -446,6 +452,8 @@ def open_page(
     with contextlib.closing(
         PageServer(lambda browser: opened[0].routes(browser), host, port, names)
     ) as server:
-        opened.append(Sessions(lambda: Session(shared, offered(objects), Importer(), window)))
+        opened.append(
+            Sessions(lambda: Session(shared, open_catalogue(objects), Importer(), window))
+        )
         with contextlib.closing(opened[0]):
             yield server.url

@@ -145,7 +145,7 @@ class Studio:
         if on and tool == "paint" and not self.canvas.avoid.any():
             self.canvas.take_parts()
         elif on and tool == "hand" and constraint not in self.fields:
-            self._set(constraint, self._closed())
+            self._set(constraint, self._closed_pose())
         elif on and tool == "path" and constraint not in self.fields:
             self._suggest(constraint)
         self._switch(constraint, on)
@@ -199,7 +199,7 @@ class Studio:
     def close_hand(self) -> None:
         """Requests a reference pose: the hand at the arrow, closed around the object."""
         name = self._drawn_by("hand")
-        self._set(name, self._closed())
+        self._set(name, self._closed_pose())
         self._switch(name, True)
 
     def draw(self, points: Any) -> None:
@@ -231,7 +231,7 @@ class Studio:
         for constraint in known(self.task):
             if tool_of(constraint) == "hand" and constraint.name in self.fields:
                 return self.fields[constraint.name]
-        return self._closed()
+        return self._closed_pose()
 
     def suggest(self, constraint: str) -> None:
         """Requests the next heading, reference pose or wrist path that training would draw for this
@@ -401,7 +401,7 @@ class Studio:
             f"Choose from its constraints: {names}.",
         )
 
-    def _closed(self) -> Fields:
+    def _closed_pose(self) -> Fields:
         """Reference pose of the hand at the arrow, closed around the object."""
         arrow = (np.asarray(part, np.float32)[None] for part in self.arrow)
         pose = closed_poses(

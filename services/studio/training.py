@@ -34,7 +34,7 @@ from congrasp.services.record.reader import (
 )
 from congrasp.services.record.writer import flatten
 from congrasp.services.studio.recordings import Recordings
-from congrasp.services.viz.plots import figures
+from congrasp.services.viz.plots import Panel, figures
 
 FIRST = ("episode/success", "episode/return", "staleness_mean", "steps_per_second")
 """Curves that a page shows by default."""
@@ -359,14 +359,21 @@ def labels_of(metrics: Iterable[str]) -> dict[str, dict[str, str]]:
     labels: dict[str, dict[str, str]] = {}
     for group, panels in figures({"": run}).values():
         for panel in panels:
-            for name in panel.metrics:
-                title = panel.title
-                if len(panel.metrics) > 1:
-                    title = f"{panel.title}: {name.rpartition('_')[2]}"
-                labels[name] = {"title": title, "unit": panel.unit, "group": group}
+            labels |= _labels_of_panel(panel, group)
     for name in sorted(metrics):
         if name not in labels:
             labels[name] = {"title": name, "unit": "", "group": "Details"}
+    return labels
+
+
+def _labels_of_panel(panel: Panel, group: str) -> dict[str, dict[str, str]]:
+    """Title, unit and group of each metric of a panel."""
+    labels = {}
+    for name in panel.metrics:
+        title = panel.title
+        if len(panel.metrics) > 1:
+            title = f"{panel.title}: {name.rpartition('_')[2]}"
+        labels[name] = {"title": title, "unit": panel.unit, "group": group}
     return labels
 
 
@@ -375,12 +382,11 @@ def _is_read(topic: str) -> bool:
     return topic.startswith(_READ) or is_episode(topic)
 
 
-def opened_window(run: str, recordings: pathlib.Path | None) -> TrainingWindow:
-    """Returns the window on a run, which reads its recordings in the background: that takes seconds
-    for a long run.
+def open_window(run: str, recordings: pathlib.Path | None) -> TrainingWindow:
+    """Opens the window on a run; a thread reads the recordings, which takes seconds for a long run.
 
     Args:
-      run: name of the run; empty for that of the recordings' folder.
+      run: name of the run; empty for the name of the recordings' folder.
       recordings: recordings of the run, if there are any.
 
     Raises:

@@ -68,7 +68,7 @@ def finished_policy(run_dir: pathlib.Path) -> pathlib.Path | None:
 
 
 def training_seconds(run_dir: pathlib.Path) -> float | None:
-    """Duration of its training in seconds; for a resumed one, that of the last session."""
+    """Duration of a run's training in s; for a resumed run, the duration of its last session."""
     try:
         return float(read_json(run_dir / _FINISHED_FILE, _MAX_FILE_BYTES)["seconds"])
     except (LookupError, TypeError, ValueError, CongraspError):

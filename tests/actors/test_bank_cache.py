@@ -21,7 +21,7 @@ OBJECTS = [procedural.generate(seed, "box") for seed in range(2)]
 @pytest.fixture(autouse=True)
 def _cache_of_small_pools(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(cache, "LEAST_OBJECTS", 2)
+    monkeypatch.setattr(cache, "MIN_OBJECTS", 2)
 
 
 class Builder:
@@ -94,8 +94,8 @@ def test_damaged_file_is_rebuilt(tmp_path):
 
 def test_cache_keeps_the_last_used_banks(tmp_path):
     build = Builder()
-    for seed in range(cache.MOST_FILES + 2):
+    for seed in range(cache.MAX_FILES + 2):
         cached_bank(HAND, TASK, OBJECTS, seed, build)
-    assert len(list((tmp_path / "congrasp" / "banks").iterdir())) == cache.MOST_FILES
-    cached_bank(HAND, TASK, OBJECTS, cache.MOST_FILES + 1, build)
-    assert build.built == cache.MOST_FILES + 2
+    assert len(list((tmp_path / "congrasp" / "banks").iterdir())) == cache.MAX_FILES
+    cached_bank(HAND, TASK, OBJECTS, cache.MAX_FILES + 1, build)
+    assert build.built == cache.MAX_FILES + 2

@@ -27,16 +27,16 @@ def pace_of(**seconds):
     ],
 )
 def test_as_many_requests_overlap_as_rollouts_pass_during_one(seconds, number):
-    assert pace_of(**seconds).overlapping("ticket", most=4) == number
+    assert pace_of(**seconds).overlap_count("ticket", most=4) == number
 
 
 def test_a_single_slow_request_counts_little():
     pace = pace_of(rollout=1.0, ticket=0.01)
     pace.record("ticket", 0.1)
-    assert pace.overlapping("ticket", most=4) == 0
+    assert pace.overlap_count("ticket", most=4) == 0
     for _ in range(5):
         pace.record("ticket", 0.1)
-    assert pace.overlapping("ticket", most=4) == 1
+    assert pace.overlap_count("ticket", most=4) == 1
 
 
 def fill(window):

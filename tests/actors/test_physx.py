@@ -26,7 +26,7 @@ from congrasp.actors.physics.physx.batch import PhysxPhysics
 from congrasp.actors.physics.physx.collisions import collisions
 from congrasp.actors.physics.physx.contacts import ContactReader
 from congrasp.actors.physics.physx.environment import CompiledScene, Environment
-from congrasp.actors.physics.physx.units import LENGTH
+from congrasp.actors.physics.physx.units import LENGTH_SCALE
 
 GRAVITY = 9.81
 BOX = procedural.generate(0, "box")
@@ -65,7 +65,7 @@ def alone(start, model=None):
 
 
 def object_position(environment):
-    return np.array(environment.object.entity_pose.p) / LENGTH
+    return np.array(environment.object.entity_pose.p) / LENGTH_SCALE
 
 
 def targets(**joints):
@@ -98,7 +98,7 @@ def test_free_fall():
     expected = 0.5 * GRAVITY * time * (time + environment.system.timestep)
     np.testing.assert_allclose(height - object_position(environment)[2], expected, rtol=1e-3)
     np.testing.assert_allclose(
-        environment.object.linear_velocity[2], -LENGTH * GRAVITY * time, rtol=1e-3
+        environment.object.linear_velocity[2], -LENGTH_SCALE * GRAVITY * time, rtol=1e-3
     )
 
 
@@ -136,7 +136,7 @@ def test_links_are_where_mujoco_has_them(physx, name):
     data.qpos[environment.scene.addresses.finger_qpos] = q
     mujoco.mj_kinematics(model, data)
     for body, link in environment.hand.bodies.items():
-        np.testing.assert_allclose(link.entity_pose.p / LENGTH, data.xpos[body], atol=1e-5)
+        np.testing.assert_allclose(link.entity_pose.p / LENGTH_SCALE, data.xpos[body], atol=1e-5)
         dot = abs(np.dot(link.entity_pose.q, data.xquat[body]))
         assert dot == pytest.approx(1.0, abs=1e-5)
 
@@ -374,7 +374,7 @@ def test_a_diverged_environment_is_marked_and_put_back(physx):
     engine = physx([BOX, BOX])
     state = engine.start(start)
     hold = np.tile(targets(), (2, 1))
-    engine.environments[1].object.linear_velocity = np.array([LENGTH * 1e4, 0.0, 0.0])
+    engine.environments[1].object.linear_velocity = np.array([LENGTH_SCALE * 1e4, 0.0, 0.0])
     state, after = engine.step(state, hold, np.ones(2, bool))
     np.testing.assert_array_equal(after.diverged, [False, True])
     np.testing.assert_allclose(after.object_position[1], start.object_position[1], atol=1e-6)

@@ -38,7 +38,7 @@ def _banks_are_built_once(tmp_path_factory):
     """Also those of pools as small as these."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        patch.setattr(cache, "LEAST_OBJECTS", 1)
+        patch.setattr(cache, "MIN_OBJECTS", 1)
         yield
 
 

@@ -63,7 +63,7 @@ def test_inputs_are_finite_and_bounded(time, hold, mass, friction):
     inputs = observed(time, hold, mass, friction)
     assert np.isfinite(list(inputs.values())).all()
     assert 0.0 <= inputs["hold_remaining"] <= 1.0
-    assert 0.0 <= inputs["load"] <= privileged.MOST_LOAD
+    assert 0.0 <= inputs["load"] <= privileged.MAX_LOAD
 
 
 @pytest.mark.parametrize(

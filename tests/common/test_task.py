@@ -20,7 +20,7 @@ from congrasp.common.task.constraints.pose import pose_gate
 from congrasp.common.task.constraints.trajectory import active_waypoint
 from congrasp.common.task.control import decode, guidance_pose
 from congrasp.common.task.features import features, scene_of
-from congrasp.common.task.geometry import FAR, squash, wrist_pose, wrist_to_joints
+from congrasp.common.task.geometry import NO_POINT_DISTANCE, squash, wrist_pose, wrist_to_joints
 from congrasp.common.task.metrics import errors
 from congrasp.common.task.observation import fields, layout, observe
 from congrasp.common.task.reward import reward_terms, terms
@@ -119,7 +119,7 @@ def test_without_an_avoid_region_there_is_nothing_to_avoid():
     geometry = FEATURES(
         state, surface._replace(avoid=np.zeros_like(surface.avoid)), goal
     ).by_constraint["affordance"]
-    assert np.all(np.asarray(geometry.distance) == np.float32(FAR))
+    assert np.all(np.asarray(geometry.distance) == np.float32(NO_POINT_DISTANCE))
     assert not np.any(geometry.nearest)
     assert not np.any(geometry.touching)
 

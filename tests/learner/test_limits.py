@@ -58,8 +58,8 @@ def test_only_granted_or_accepted_requests_are_free(meta, cost):
     for _ in range(25):
         if meta is None:
             with pytest.raises(CongraspError, match="bad"):
-                limit.charging(handler)(A, request)
+                limit.wrap_handler(handler)(A, request)
         else:
-            assert limit.charging(handler)(A, request).meta == meta
+            assert limit.wrap_handler(handler)(A, request).meta == meta
     assert limit.admits(A) == (cost == 0)
     assert limit.admits(B)

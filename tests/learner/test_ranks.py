@@ -17,7 +17,7 @@ import pytest
 from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.transport.ports import free_port
 from congrasp.learner.distributed import ranks as ranks_module
-from congrasp.learner.distributed.ranks import Ranks, accept_links, ended_by, open_link
+from congrasp.learner.distributed.ranks import Ranks, accept_links, first_ending, open_link
 from congrasp.learner.distributed.relay import relay
 from congrasp.learner.run_directory import create_run
 from tests.conftest import ROOT
@@ -88,7 +88,7 @@ def test_an_urgent_entry_ends_the_round_for_all(party):
     assert second.poll(0.2) is None
     third.post({"end": "a signal"}, urgent=True)
     for rank in (second, third):
-        assert ended_by(rank.poll(10.0).meta["entries"]) == (2, "a signal")
+        assert first_ending(rank.poll(10.0).meta["entries"]) == (2, "a signal")
     assert first.poll(10.0).meta["entries"][0] is None
     # And the next round is whole again
     party.everywhere(lambda rank: party.ranks[rank].exchange({}))
@@ -149,7 +149,7 @@ def test_the_end_of_the_coordinator_is_not_passed_on_to_jax():
 def test_a_process_alone_agrees_with_itself():
     alone = Ranks.join(0, 1, "")
     alone.post({"end": ""})
-    assert ended_by(alone.poll(0.0).meta["entries"]) is None
+    assert first_ending(alone.poll(0.0).meta["entries"]) is None
     assert alone.exchange({"x": 1}).meta["entries"] == [{"x": 1}]
     alone.close()
 

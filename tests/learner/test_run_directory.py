@@ -139,7 +139,7 @@ def test_versions_continue_from_journals_without_the_version_file(run, damage):
     log = AuditLog(folder, "0")
     log.begin("session", "run", 3, 1, kept=True)
     assert published_version(folder) == 3
-    log.used(21, [], [])
+    log.record_uses(21, [], [])
     assert published_version(folder) == 22
 
 

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from congrasp.learner.hub.write_ahead import PART, WriteAheadLog
+from congrasp.learner.hub.write_ahead import PART_SUFFIX, WriteAheadLog
 from tests.learner.hub_bench import bundle, sequences
 
 
@@ -122,7 +122,7 @@ def test_damaged_torn_and_foreign_files_are_told_apart(bench, log, folder):
     damaged, renamed = sorted(folder.iterdir())[1:3]
     damaged.write_bytes(damaged.read_bytes()[:-3] + b"xyz")
     renamed.rename(folder / renamed.name.replace("~2.", "~9."))
-    (folder / f"000000000009~a~01~5.safetensors{PART}").write_bytes(
+    (folder / f"000000000009~a~01~5.safetensors{PART_SUFFIX}").write_bytes(
         b"torn, and so never acknowledged"
     )
     # Which would keep a reader waiting for ever

@@ -13,7 +13,7 @@ from congrasp.actors.physics.physx.transmission import (
     couplings_of,
     servos_of,
 )
-from congrasp.actors.physics.physx.units import INERTIA, LENGTH, scaled_pose
+from congrasp.actors.physics.physx.units import INERTIA_SCALE, LENGTH_SCALE, scaled_pose
 from congrasp.common.ranges import MAX_SPEED
 from congrasp.common.runtime.physics_library import mujoco
 
@@ -85,9 +85,9 @@ class Articulation:
         self._entities: list[Any] = []
         self._joints: dict[int, Any] = {}
         is_slide = model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE
-        self._units = np.where(is_slide, LENGTH, 1.0)
+        self._units = np.where(is_slide, LENGTH_SCALE, 1.0)
         """(njnt,) positions of joints in PhysX per m or rad."""
-        self._gain_units = np.where(is_slide, 1.0, INERTIA)
+        self._gain_units = np.where(is_slide, 1.0, INERTIA_SCALE)
         """(njnt,) gains and armatures of joints in PhysX per SI unit."""
         base = model.body("hand_base").id
         self.bodies = {base: self._base()}
@@ -155,12 +155,12 @@ class Articulation:
         link.linear_damping = 0.0
         link.angular_damping = 0.0
         link.max_angular_velocity = MAX_SPEED
-        link.max_linear_velocity = LENGTH * MAX_SPEED
+        link.max_linear_velocity = LENGTH_SCALE * MAX_SPEED
         link.disable_gravity = True
         return link
 
     def _add_body(self, body: int) -> Any:
-        """Adds the links of a body, and returns the last one, which has its shapes and mass."""
+        """Adds the links of a body; returns the last link, which has the body's shapes and mass."""
         model = self._model
         link = self.bodies[model.body_parentid[body]]
         pose_in_parent = scaled_pose(model.body_pos[body], model.body_quat[body])
@@ -180,7 +180,7 @@ class Articulation:
         return link
 
     def _set_joint(self, link: Any, joint: int, pose_in_parent: Any) -> None:
-        """Makes the joint between a link and its parent that of the model.
+        """Sets the joint between a link and its parent to a joint of the model.
 
         Args:
           link: the child link.
@@ -254,8 +254,9 @@ class Articulation:
         self._tendon_drives = [drive for drive in self._drives if len(drive.others)]
 
     def _couple(self, coupling: Coupling) -> None:
-        """Makes a joint follow its neighbour by a stiff tendon of PhysX: a link that carries a
-        joint of the tendon, then the links that the joints move.
+        """Makes a joint follow its neighbour by a stiff tendon of PhysX.
+
+        The tendon lists the link that carries its first joint, then the links that its joints move.
         """
         leader = self._joints[coupling.leader].child_link
         follower = self._joints[coupling.follower].child_link
@@ -270,7 +271,7 @@ class Articulation:
             weights,
             weights,
             rest_length=coupling.offset,
-            stiffness=INERTIA * _COUPLING_STIFFNESS,
+            stiffness=INERTIA_SCALE * _COUPLING_STIFFNESS,
         )
 
 
@@ -279,7 +280,7 @@ def set_inertia(body: Any, mass: float, principal: np.ndarray, centre: Any) -> N
     axes in the body. Attaching a shape changes all of them: call it afterwards.
     """
     body.set_mass(float(mass))
-    body.set_inertia((INERTIA * np.asarray(principal)).astype(np.float32))
+    body.set_inertia((INERTIA_SCALE * np.asarray(principal)).astype(np.float32))
     body.set_cmass_local_pose(centre)
 
 

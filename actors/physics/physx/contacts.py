@@ -11,7 +11,7 @@ import numpy as np
 
 from congrasp.actors.physics.physx.environment import Environment
 from congrasp.actors.physics.physx.library import sapien
-from congrasp.actors.physics.physx.units import LENGTH
+from congrasp.actors.physics.physx.units import LENGTH_SCALE
 from congrasp.common.task.types import CONTACTS_PER_LINK
 
 _LEAST_FORCE = 1e-4
@@ -79,7 +79,7 @@ class ContactReader:
         """Contacts with the object, and normal forces (3,) of the table, by the number of the
         link.
         """
-        per_force = self._environment.system.timestep * LENGTH
+        per_force = self._environment.system.timestep * LENGTH_SCALE
         body = self._environment.object
         with_object: dict[int, list[Contact]] = {}
         on_table: dict[int, np.ndarray] = {}
@@ -103,7 +103,7 @@ class ContactReader:
                 if size < _LEAST_FORCE:
                     continue
                 if other is body:
-                    contact = Contact(force, size, point.position / LENGTH)
+                    contact = Contact(force, size, point.position / LENGTH_SCALE)
                     with_object.setdefault(number, []).append(contact)
                 else:
                     on_table[number] = on_table.get(number, np.zeros(3)) + force
@@ -120,7 +120,7 @@ class ContactReader:
         """Force (3,) of its parent on a link, world frame; PhysX gives it in the joint's frame."""
         frame = link.entity_pose * link.joint.pose_in_child
         rotation = sapien.Pose(q=frame.q).to_transformation_matrix()[:3, :3]
-        force: np.ndarray = rotation @ incoming[self._rows[link], :3] / LENGTH
+        force: np.ndarray = rotation @ incoming[self._rows[link], :3] / LENGTH_SCALE
         return force
 
 

@@ -9,7 +9,7 @@ from congrasp.actors.physics.physx.articulation import Articulation, HandStart, 
 from congrasp.actors.physics.physx.collisions import Collisions, Frictions, frictions
 from congrasp.actors.physics.physx.library import configure, px, sapien
 from congrasp.actors.physics.physx.shapes import geom_shape, material, plane
-from congrasp.actors.physics.physx.units import LENGTH, scaled_pose
+from congrasp.actors.physics.physx.units import LENGTH_SCALE, scaled_pose
 from congrasp.actors.physics.scene import TABLE_AWAY, Addresses
 from congrasp.common.ranges import MAX_SPEED
 from congrasp.common.runtime.physics_library import mujoco
@@ -40,7 +40,7 @@ class Environment:
         self.scene = scene
         self.reset_state = reset_state
         model = scene.model
-        configure(model.opt.gravity, LENGTH)
+        configure(model.opt.gravity, LENGTH_SCALE)
         self.system = px.PhysxCpuSystem()
         self.system.timestep = model.opt.timestep
         # The scene keeps the entities; sapien's default would have a renderer.
@@ -80,7 +80,7 @@ class Environment:
         for _ in range(substeps):
             self.hand.update_tendons()
             if push is not None:
-                self.object.add_force_torque(LENGTH * push, np.zeros(3, np.float32))
+                self.object.add_force_torque(LENGTH_SCALE * push, np.zeros(3, np.float32))
             self.system.step()
 
     def read(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
@@ -90,9 +90,9 @@ class Environment:
         addresses = self.scene.addresses
         self.hand.read(qpos, qvel)
         pose = self.object.entity_pose
-        qpos[addresses.object_qpos[:3]] = pose.p / LENGTH
+        qpos[addresses.object_qpos[:3]] = pose.p / LENGTH_SCALE
         qpos[addresses.object_qpos[3:]] = pose.q
-        qvel[addresses.object_qvel[:3]] = self.object.linear_velocity / LENGTH
+        qvel[addresses.object_qvel[:3]] = self.object.linear_velocity / LENGTH_SCALE
         qvel[addresses.object_qvel[3:]] = self.object.angular_velocity
 
     def _add_object(self, surfaces: Frictions) -> None:

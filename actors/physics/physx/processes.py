@@ -96,11 +96,11 @@ class PhysxProcesses:
         self._local.close()
 
     def _set_processes(self, count: int) -> None:
-        """Starts or ends processes, so that there are `count` including this one."""
+        """Starts or ends processes, until there are `count` including this process."""
         while len(self._workers) >= count:
             self._workers.pop().stop()
         running = len(self._workers)
-        with self._closed_on_errors():
+        with self._close_on_errors():
             while 1 + len(self._workers) < count:
                 self._workers.append(WorkerProcess(serve))
             # All have started before the first of them reads its message
@@ -119,12 +119,12 @@ class PhysxProcesses:
     def _distribute(
         self, call: Callable[..., Any], arguments: Sequence[Sequence[Any]]
     ) -> list[Any]:
-        """Makes a call in each process, of which this one is the first, and returns the results.
+        """Makes a call in each process; returns the results, first the one of this process.
 
         Raises:
           CongraspError: a process has ended, or its call raised one.
         """
-        with self._closed_on_errors():
+        with self._close_on_errors():
             for worker, of_worker in zip(self._workers, arguments[1:], strict=True):
                 worker.send((call, of_worker))
             results = [call(self._local, *arguments[0])]
@@ -136,7 +136,7 @@ class PhysxProcesses:
         return results
 
     @contextlib.contextmanager
-    def _closed_on_errors(self) -> Iterator[None]:
+    def _close_on_errors(self) -> Iterator[None]:
         """Closes the engine on errors, since the next call would receive the results of this one.
 
         Raises:
@@ -163,8 +163,9 @@ class _Failure(NamedTuple):
 
 
 def serve(caller: Messages) -> None:
-    """Makes the calls of the process at the other end, whose first message has the arguments of the
-    engine, until that ends.
+    """Makes the calls of another process until that process ends.
+
+    The first message has the arguments of the engine.
     """
     with contextlib.suppress(EOFError, OSError):
         engine = PhysxPhysics(*caller.receive())

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from congrasp.actors.physics.physx.library import px, sapien
-from congrasp.actors.physics.physx.units import LENGTH, scaled_pose
+from congrasp.actors.physics.physx.units import LENGTH_SCALE, scaled_pose
 from congrasp.common.errors import CongraspError
 from congrasp.common.runtime.physics_library import mujoco
 
@@ -60,19 +60,19 @@ def plane(surface: Any) -> Any:
 
 def _box(model: mujoco.MjModel, geom: int, surface: Any) -> tuple[Any, Any]:
     """A box, and its pose in the geom."""
-    half_size = (LENGTH * model.geom_size[geom]).astype(np.float32)
+    half_size = (LENGTH_SCALE * model.geom_size[geom]).astype(np.float32)
     return px.PhysxCollisionShapeBox(half_size, surface), sapien.Pose()
 
 
 def _sphere(model: mujoco.MjModel, geom: int, surface: Any) -> tuple[Any, Any]:
     """A sphere, and its pose in the geom."""
-    radius = LENGTH * model.geom_size[geom, 0]
+    radius = LENGTH_SCALE * model.geom_size[geom, 0]
     return px.PhysxCollisionShapeSphere(radius, surface), sapien.Pose()
 
 
 def _capsule(model: mujoco.MjModel, geom: int, surface: Any) -> tuple[Any, Any]:
     """A capsule, and its pose in the geom."""
-    radius, half_length, _ = LENGTH * model.geom_size[geom]
+    radius, half_length, _ = LENGTH_SCALE * model.geom_size[geom]
     shape = px.PhysxCollisionShapeCapsule(radius, half_length, surface)
     return shape, sapien.Pose(q=_X_TO_Z)
 
@@ -115,7 +115,7 @@ def _convex(vertices: np.ndarray, scale: Any, surface: Any) -> Any:
     """The convex hull of vertices (V, 3) within the cube from -1 to 1, scaled (3,) to metres
     afterwards: PhysX merges vertices that are near in its units.
     """
-    size = (LENGTH * np.asarray(scale)).astype(np.float32)
+    size = (LENGTH_SCALE * np.asarray(scale)).astype(np.float32)
     return px.PhysxCollisionShapeConvexMesh(vertices.astype(np.float32), size, surface)
 
 

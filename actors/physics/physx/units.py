@@ -10,12 +10,12 @@ import numpy as np
 
 from congrasp.actors.physics.physx.library import sapien
 
-LENGTH = 100.0
+LENGTH_SCALE = 100.0
 """Lengths, speeds and forces in PhysX per SI unit."""
-INERTIA = LENGTH**2
+INERTIA_SCALE = LENGTH_SCALE**2
 """Moments of inertia, torques, and gains of hinges in PhysX per SI unit."""
 
 
 def scaled_pose(position: Any = (0.0, 0.0, 0.0), quaternion: Any = (1.0, 0.0, 0.0, 0.0)) -> Any:
     """Returns a pose for PhysX of a position (3,) in m and a quaternion (4,)."""
-    return sapien.Pose(LENGTH * np.asarray(position, float), quaternion)
+    return sapien.Pose(LENGTH_SCALE * np.asarray(position, float), quaternion)

@@ -24,7 +24,7 @@ from congrasp.common.task.constraints.specs import (
     Weight,
 )
 from congrasp.common.task.geometry import (
-    FAR,
+    NO_POINT_DISTANCE,
     flat,
     least_distance_to_segment,
     nearest_index,
@@ -58,8 +58,8 @@ class AffordanceFeatures(NamedTuple):
     has none.
     """
     distance: Array
-    """(B,) least distance from the fingers' skin to the avoid region, m; `FAR` if the object has
-    none.
+    """(B,) least distance from the fingers' skin to the avoid region, m; `NO_POINT_DISTANCE` for an
+    object without such a region.
     """
     touching: Array
     """(B, L) bool: the link touches the avoid region."""
@@ -170,7 +170,7 @@ class Affordance(Constraint):
         skin = jnp.linalg.norm(nearest, axis=-1) - jnp.array(hand.keypoint_radii)
         return AffordanceFeatures(
             nearest=rotations.apply(rotations.to_matrix(features.object_quaternion), nearest),
-            distance=jnp.where(has_any, jnp.min(skin[..., 1:], -1), FAR),
+            distance=jnp.where(has_any, jnp.min(skin[..., 1:], -1), NO_POINT_DISTANCE),
             touching=jnp.any(contacts.found & on_avoid, -1),
             touching_graspable=jnp.any(contacts.found & ~on_avoid, -1),
             force=jnp.sum(contacts.force * on_avoid[..., None], -2),

@@ -111,7 +111,9 @@ class Constraint:
     def joined(
         self, task: TaskSettings, active: Mapping[str, Array], uniform: Array
     ) -> Array | None:
-        """(B,) bool: training episodes that request it because of others; None for none.
+        """(B,) bool: training episodes that request this constraint because of other constraints.
+
+        None if other constraints do not matter.
 
         Args:
           task: the task.
@@ -131,8 +133,9 @@ class Constraint:
         return jnp.ones(draw.objects.shape, bool)
 
     def allowed(self, draw: Draw) -> Array:
-        """(B, M) bool: references of the drawn objects from which it may be drawn; by default those
-        clear of the table.
+        """(B, M) bool: references of the drawn objects from which a goal may be drawn.
+
+        The default are the references clear of the table.
 
         `draw` has no `reference` at this point.
         """
@@ -157,7 +160,7 @@ class Constraint:
     def override(
         self, hand: Hand, surface: Surface, requested: Mapping[str, Array], goal: Goal
     ) -> Goal:
-        """Returns the goal with the arrays of weaker constraints that this one replaces.
+        """Returns the goal, in which this constraint replaces arrays of weaker constraints.
 
         Args:
           hand: the hand.

@@ -23,9 +23,9 @@ from congrasp.common.task.scene import Scene
 from congrasp.common.task.settings import GRAVITY, TaskSettings
 from congrasp.common.task.types import Array, Surface
 
-LEAST = 1.0
+_MIN_DRAWN_LIMIT = 1.0
 """Lowest limit drawn in training, N; heavier objects need a higher one."""
-MOST = 20.0
+_MAX_DRAWN_LIMIT = 20.0
 """Highest limit drawn in training, N."""
 _MIN_REQUEST = 0.5
 """Lowest limit of a request, N."""
@@ -77,7 +77,7 @@ class Force(Constraint):
     def sample(self, hand: Hand, draw: Draw, uniform: Array) -> ForceGoal:
         """Samples log-uniformly between the least limit for the episode's object and 20 N."""
         low = jnp.log(least_force(draw.mass, draw.friction))
-        return ForceGoal(jnp.exp(low + uniform[:, 0] * (jnp.log(MOST) - low)))
+        return ForceGoal(jnp.exp(low + uniform[:, 0] * (jnp.log(_MAX_DRAWN_LIMIT) - low)))
 
     def explain(self, overridden: Sequence[str], redirected: bool) -> list[str]:
         """The limit is compatible with every other constraint."""
@@ -86,7 +86,7 @@ class Force(Constraint):
     def fields(self, hand: Hand, task: TaskSettings) -> tuple[tuple[ObservationField, ...], ...]:
         """Fields for the limit and each link's excess."""
         block = (
-            ObservationField("force_limit", 1, f"the limit divided by {MOST:g} N"),
+            ObservationField("force_limit", 1, f"the limit divided by {_MAX_DRAWN_LIMIT:g} N"),
             ObservationField(
                 "force_over",
                 len(hand.links),
@@ -99,7 +99,7 @@ class Force(Constraint):
     def observe(self, scene: Scene) -> tuple[list[Array], ...]:
         """The limit and the squashed excess of each link."""
         excess = _excess(scene)
-        return ([_limit(scene) / MOST, excess / (excess + FORCE_SCALE)],)
+        return ([_limit(scene) / _MAX_DRAWN_LIMIT, excess / (excess + FORCE_SCALE)],)
 
     def force_max(self, scene: Scene, most: Array) -> Array:
         """No force beyond the limit earns anything."""
@@ -166,7 +166,7 @@ def least_force(mass: Array, friction: Array) -> Array:
     Thumb and fingers press on opposite sides, each of which carries half of the weight by friction.
     The fingers share their side; the thumb carries the other.
     """
-    return jnp.clip(mass * GRAVITY / (2.0 * friction), LEAST, MOST)
+    return jnp.clip(mass * GRAVITY / (2.0 * friction), _MIN_DRAWN_LIMIT, _MAX_DRAWN_LIMIT)
 
 
 def _limit(scene: Scene) -> Array:

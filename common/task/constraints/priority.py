@@ -45,13 +45,13 @@ class Contradiction(NamedTuple):
 
 
 def _overrides(stronger: Constraint, name: str) -> bool:
-    """True if it overrides the constraint of this name or one of its blocks."""
+    """True if a constraint overrides the constraint `name` or one of its blocks."""
     weaker = get_constraint(name)
     return any(_overrides_block(stronger, block, weaker) for block in (name, *weaker.blocks))
 
 
 def _overrides_block(stronger: Constraint, block: str, owner: Constraint) -> bool:
-    """True if it overrides a block, by the block's name or by that of its constraint."""
+    """True if a constraint overrides a block, by the name of the block or of its owner."""
     listed = block in stronger.overrides or owner.name in stronger.overrides
     return listed or stronger.name in owner.overridden_by
 
@@ -93,9 +93,7 @@ def _is_moot(relation: Relation, stronger: Constraint, requested: Mapping[str, A
 
 
 def _relations(requested: Iterable[str]) -> list[tuple[Constraint, Relation]]:
-    """Relations between constraints that may be requested together, those of the strongest
-    first.
-    """
+    """Relations between constraints that may be requested together, strongest constraint first."""
     names = {*requested, "heading"}
     relations = []
     for constraint in reversed(CONSTRAINTS):

@@ -17,9 +17,9 @@ from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.sampling.bank import SHARED, ConstraintBank
 from congrasp.common.wire.codec import Message
 
-LEAST_OBJECTS = 64
+MIN_OBJECTS = 64
 """Pools of at least this size are cached."""
-MOST_FILES = 8
+MAX_FILES = 8
 """Most banks in the cache; that of 800 objects takes about 50 MB."""
 _IRRELEVANT = (
     "reward",
@@ -52,7 +52,7 @@ def cached_bank(
     Only banks of large pools are cached: they depend on objects, hand and task, and take long to
     build.
     """
-    if len(objects) < LEAST_OBJECTS:
+    if len(objects) < MIN_OBJECTS:
         return build()
     path = cache_folder("banks") / f"{_key(hand, task, objects, seed)}.safetensors"
     message = read_kept(path)
@@ -60,7 +60,7 @@ def cached_bank(
         return jax.device_put(ConstraintBank(**message.arrays))
     bank = build()
     arrays = {name: np.asarray(getattr(bank, name)) for name in SHARED}
-    keep(path, Message(arrays), MOST_FILES)
+    keep(path, Message(arrays), MAX_FILES)
     return bank
 
 

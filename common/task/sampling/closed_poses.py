@@ -37,7 +37,7 @@ class Poses(NamedTuple):
 
 
 class FingerGroups(NamedTuple):
-    """Fingers that close on their own; those moved by the same motor count as one."""
+    """Groups of fingers that close independently. Fingers of one motor are one group."""
 
     of_joint: np.ndarray
     """(F,) index of the group of each joint; -1 for none."""

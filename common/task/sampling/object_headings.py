@@ -29,7 +29,7 @@ class _Regions(NamedTuple):
     """Headings for the graspable region; None if it is out of reach."""
 
     def both(self) -> list[Headings]:
-        """Headings of V = 2 regions; those of the whole surface substitute for missing ones."""
+        """Headings of V = 2 regions. The whole surface replaces a graspable region out of reach."""
         return [self.whole, self.graspable or self.whole]
 
 
@@ -80,7 +80,7 @@ def headings_of(
     if prescribed is not None:
         regions = _Regions(prescribed, prescribed)
     else:
-        regions = _sampled(obj, rng, scale, hand_outline, opposed=opposed)
+        regions = _sample_regions(obj, rng, scale, hand_outline, opposed=opposed)
     # Captured headings may be off by a centimetre, but a hand did hold their objects.
     avoid = None
     if regions.graspable is not None and prescribed is None:
@@ -124,7 +124,7 @@ def _stacked(parts: Sequence[Headings]) -> Headings:
     return Headings(*[np.stack(arrays) for arrays in zip(*parts, strict=True)])
 
 
-def _sampled(
+def _sample_regions(
     obj: GraspObject,
     rng: np.random.Generator,
     scale: float,
@@ -184,8 +184,9 @@ def _reach(
 def _steep_where_possible(
     reachable: np.ndarray, regions: _Regions, rests: np.ndarray
 ) -> np.ndarray:
-    """(V, R, H) bool: reachable headings from above in resting poses (R, 7) that have any, all
-    reachable ones in the others.
+    """(V, R, H) bool: reachable headings from above in each resting pose (R, 7).
+
+    In a resting pose without such headings, all reachable headings.
     """
     steep = []
     for headings in regions.both():

@@ -27,7 +27,7 @@ _CANDIDATES = 4
 
 
 class Grasped(NamedTuple):
-    """N objects that a hand closes around, and the headings at which it does."""
+    """N objects that a hand closes around, and the headings of these grasps."""
 
     points: Array
     """(N, P, 3) surface points."""

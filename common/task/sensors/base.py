@@ -150,8 +150,9 @@ class Sensor:
         return {}
 
     def query(self, hand: Hand, task: TaskSettings) -> Mapping[str, tuple[int, ...]]:
-        """Shapes, without batch axis, of further fields of a query to a live policy, among them
-        those of `measure`.
+        """Shapes, without batch axis, of further fields of a query to a live policy.
+
+        They include the fields of `measure`.
         """
         return {}
 

@@ -206,6 +206,19 @@ def known_frames(name: str, present: np.ndarray, *arrays: np.ndarray) -> list[np
     return [array[frames] for array in arrays]
 
 
+def _mesh_path(folder: pathlib.Path, name: str, inside: str) -> pathlib.Path | None:
+    """The mesh file of an object in a folder, else the folder of its name; None without both."""
+    files = [folder / f"{name}{suffix}" for suffix in SUFFIXES]
+    if inside:
+        files.append(folder / name / inside)
+    for file in files:
+        if file.is_file():
+            return file
+    if (folder / name).is_dir():
+        return folder / name
+    return None
+
+
 @dataclasses.dataclass(frozen=True)
 class Meshes:
     """Folders searched for the meshes of objects, in this order."""
@@ -230,14 +243,9 @@ class Meshes:
         for name in names:
             file_name(name, "the mesh of an object")
             for folder in self.folders:
-                files = [folder / f"{name}{suffix}" for suffix in SUFFIXES]
-                if inside:
-                    files.append(folder / name / inside)
-                for file in files:
-                    if file.is_file():
-                        return file
-                if (folder / name).is_dir():
-                    return folder / name
+                path = _mesh_path(folder, name, inside)
+                if path is not None:
+                    return path
         where = ""
         if self.folders:
             where = f" in {', '.join(map(str, self.folders))}"

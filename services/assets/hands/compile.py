@@ -289,9 +289,9 @@ def _asset_files(spec: mujoco.MjSpec) -> Iterator[tuple[Any, str, str]]:
     )
     for folder, assets in folders:
         for asset in assets:
-            for name in (asset.file, *getattr(asset, "cubefiles", ())):
-                if name:
-                    yield asset, name, os.path.normpath(os.path.join(folder, name))
+            names = filter(None, (asset.file, *getattr(asset, "cubefiles", ())))
+            for name in names:
+                yield asset, name, os.path.normpath(os.path.join(folder, name))
 
 
 def _mesh_reason(error: str) -> str:

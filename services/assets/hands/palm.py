@@ -17,32 +17,38 @@ def hinges(model: mujoco.MjModel, body: int) -> list[int]:
 
 
 def find_palm(model: mujoco.MjModel, notes: list[str]) -> int:
-    """Returns the body with most branches; of several, one named as a palm, the last from the root.
+    """Returns the body with most branches.
+
+    Of several with as many branches, one named as a palm is preferred, and then the last from the
+    root.
 
     Args:
       model: model with a hand.
       notes: other bodies that could be the palm are appended.
     """
-    branches = _branches(model)
-    forks = {}
-    for link, count in branches.items():
-        if count > 1:
-            forks[link] = _forks(model, link)
-    if not forks:
-        forks = {0: [0]}
-    most = max(branches.get(link, 0) for link in forks)
-    best = [link for link in forks if branches.get(link, 0) == most]
-    named = [link for link in best if _is_named_palm(model, forks[link][0])]
-    palm = forks[max(named or best)][0]
+    candidates = _candidates(model)
+    links_named_palm = [
+        link for link, bodies in candidates.items() if _is_named_palm(model, bodies[0])
+    ]
+    palm_link = max(links_named_palm or candidates)
+    palm = candidates[palm_link][0]
     others = []
-    for link in best:
-        for body in forks[link]:
-            is_choice = body or len(forks[link]) > 1
-            if is_choice and body != palm:
-                others.append(model.body(body).name)
+    for bodies in candidates.values():
+        if bodies == [0]:  # the world alone, which is not the part of a hand
+            continue
+        others += [model.body(body).name for body in bodies if body != palm]
     if others:
         notes.append(f"the palm could also be {' or '.join(others)} (--palm)")
     return palm
+
+
+def _candidates(model: mujoco.MjModel) -> dict[int, list[int]]:
+    """Bodies with most branches (`_forks`), by their link; the world if no link has two."""
+    branches = _branches(model)
+    most = max(branches.values(), default=0)
+    if most < 2:
+        return {0: [0]}
+    return {link: _forks(model, link) for link, count in branches.items() if count == most}
 
 
 def _branches(model: mujoco.MjModel) -> dict[int, int]:

@@ -78,6 +78,24 @@ class _Scale(NamedTuple):
         return mesh
 
 
+class _Shape(NamedTuple):
+    """The surfaces of an object, m, in the frame of `_Scale`."""
+
+    meshes: list[trimesh.Trimesh]
+    """Surfaces that face outwards."""
+    parts: list[trimesh.Trimesh]
+    """Surfaces of the object's parts; empty if `meshes` are the parts."""
+    surface: trimesh.Trimesh
+    """All `meshes` as one."""
+    solid: Enclosed | None
+    """Measures of the space inside; None for an open surface."""
+
+    @property
+    def is_closed(self) -> bool:
+        """True if each of the meshes encloses a volume."""
+        return self.solid is not None
+
+
 class _Labels(NamedTuple):
     """Parts of an object."""
 
@@ -102,36 +120,24 @@ def assemble(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     notes: list[str] = []
     files = _read(source, options, notes)
     scale = _scale(source, files, options, notes)
-    meshes = [scale.mesh(mesh) for mesh in files.visuals]
-    parts = [scale.mesh(mesh) for mesh in files.parts]
-    surface = trimesh.util.concatenate(meshes).copy()
-    closed = all(encloses(mesh) for mesh in meshes)
-    if not closed and not options.material:
-        notes.append(_open_surface_note(source))
-    solid = enclosed(np.asarray(surface.triangles)) if closed else None
-    if solid and solid.overlaps:
-        notes.append("its bodies overlap: overlapping volume is weighed once")
-    surfaces = _surfaces(meshes, solid, notes)
-    weight_by_material = None
-    if options.material:  # before the cut, which takes long: the material may be unknown
-        part_names = [part.part for part in source.parts]
-        weight_by_material = weigh_parts(meshes, parts or meshes, options.material, part_names)
-    own_pieces = [scale.points(piece) for piece in files.pieces]
-    collision = _collision(source, own_pieces, surfaces, options, notes)
+    shape = _shape(files, scale)
+    _note_volume(source, shape, options, notes)
+    surfaces = _surfaces(shape.meshes, shape.solid, notes)
+    # Weighed before the cut into pieces, which takes long: the material may be unknown.
+    weight_by_material = _weigh_by_material(source, shape, options)
+    file_pieces = [scale.points(piece) for piece in files.pieces]
+    collision = _collision(source, file_pieces, surfaces, options, notes)
     weight = weight_by_material
     if weight is None:
-        solid_hulls = collision.hulls if source.pieces else [np.asarray(surface.vertices)]
-        weight = weigh_evenly(surface, solid, solid_hulls, options.density)
+        weight = _weigh_evenly(source, shape, collision, options)
     weight = _with_mass(weight, options.mass)
-    pieces = tuple(
-        _piece(hull, weight.center, owner)
-        for hull, owner in zip(collision.hulls, collision.owners, strict=True)
-    )
+    pieces = _pieces(collision, weight.center)
+    surface = shape.surface.copy()
     surface.apply_translation(-weight.center)
     points, normals, faces = sample_mesh(
-        np.asarray(surface.triangles), pieces, np.random.default_rng(seed), oriented=closed
+        np.asarray(surface.triangles), pieces, np.random.default_rng(seed), oriented=shape.is_closed
     )
-    labels = _labels(source, meshes, parts, weight.center, points, faces)
+    labels = _labels(source, shape, weight.center, points, faces)
     if not source.parts_are_pieces:
         pieces = with_labels(pieces, points, labels.of_points)
     _note_graspable_share(labels, notes)
@@ -164,13 +170,50 @@ def assemble(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     return obj if source.parts else cut_to_hold(obj)
 
 
-def _open_surface_note(source: Source) -> str:
-    """Note on an object whose surface encloses no volume."""
+def _shape(files: _Files, scale: _Scale) -> _Shape:
+    """The surfaces of the files in metres."""
+    meshes = [scale.mesh(mesh) for mesh in files.visuals]
+    parts = [scale.mesh(mesh) for mesh in files.parts]
+    surface = trimesh.util.concatenate(meshes).copy()
+    solid = None
+    if all(encloses(mesh) for mesh in meshes):
+        solid = enclosed(np.asarray(surface.triangles))
+    return _Shape(meshes, parts, surface, solid)
+
+
+def _note_volume(source: Source, shape: _Shape, options: ImportOptions, notes: list[str]) -> None:
+    """Appends a note if the surface encloses no volume, or some of it twice."""
+    if shape.solid and shape.solid.overlaps:
+        notes.append("its bodies overlap: overlapping volume is weighed once")
+    if shape.is_closed or options.material:
+        return
     replacement = "pieces" if source.pieces else "hull"
-    return (
+    notes.append(
         f"its surface is open: mass and inertia are those of its convex {replacement} "
         "(--material weighs its wall, and --mass sets the mass)"
     )
+
+
+def _weigh_by_material(source: Source, shape: _Shape, options: ImportOptions) -> Weight | None:
+    """Mass properties by the material of the options; None if they have none.
+
+    Raises:
+      CongraspError: the material is unknown.
+    """
+    if not options.material:
+        return None
+    names = [part.part for part in source.parts]
+    return weigh_parts(shape.meshes, shape.parts or shape.meshes, options.material, names)
+
+
+def _weigh_evenly(
+    source: Source, shape: _Shape, collision: Collision, options: ImportOptions
+) -> Weight:
+    """Mass properties of an evenly dense object."""
+    hulls = [np.asarray(shape.surface.vertices)]
+    if source.pieces:
+        hulls = collision.hulls
+    return weigh_evenly(shape.surface, shape.solid, hulls, options.density)
 
 
 def _with_mass(weight: Weight, mass: float | None) -> Weight:
@@ -184,28 +227,48 @@ def _read(source: Source, options: ImportOptions, notes: list[str]) -> _Files:
     """Reads and repairs the meshes of a source."""
     up = options.up
     piece_meshes = [read_mesh(file.path, up=up) for file in source.pieces]
-    visuals = [read_mesh(file.path, notes, up) for file in source.visuals]
+    visual_meshes = [read_mesh(file.path, notes, up) for file in source.visuals]
     parts: list[trimesh.Trimesh] = []
     if not source.parts_are_pieces:
         parts = [read_mesh(file.path, up=up) for file in source.parts]
-    axis = up_of((visuals or piece_meshes)[0], up)
+    axis = up_of((visual_meshes or piece_meshes)[0], up)
     if axis == "y":
         notes.append(
             "its y axis, which points up in the file, became its z axis (--up z leaves the axes)"
         )
-    coloured = [
-        file.path
-        for file, mesh in zip(source.visuals, visuals, strict=True)
-        if mesh.metadata["kind"] != "stl"
-    ]
     pieces = [np.asarray(mesh.vertices, np.float64) for mesh in piece_meshes]
-    if not visuals:
-        visuals = [shapes.triangulate(piece) for piece in pieces]
-    if not pieces and not source.parts:
-        visuals = [_object_of_scan(mesh, options, notes) for mesh in visuals]
+    surfaces = visual_meshes or [shapes.triangulate(piece) for piece in pieces]
     if not source.parts:
-        visuals = [repair.close_and_orient(mesh, notes) for mesh in visuals]
-    return _Files(pieces, visuals, parts, axis, coloured)
+        surfaces = _repair(surfaces, options, notes, is_scan=not source.pieces)
+    coloured = _files_with_colours(source, visual_meshes)
+    return _Files(pieces, surfaces, parts, axis, coloured)
+
+
+def _repair(
+    surfaces: list[trimesh.Trimesh], options: ImportOptions, notes: list[str], *, is_scan: bool
+) -> list[trimesh.Trimesh]:
+    """Closes surfaces and turns them outwards.
+
+    Args:
+      surfaces: surfaces of the object, in the files' unit.
+      options: options of the import.
+      notes: the repairs are appended.
+      is_scan: True if the surfaces may include a table and other bodies, which are removed.
+    """
+    if is_scan:
+        surfaces = [_object_of_scan(mesh, options, notes) for mesh in surfaces]
+    return [repair.close_and_orient(mesh, notes) for mesh in surfaces]
+
+
+def _files_with_colours(
+    source: Source, visual_meshes: Sequence[trimesh.Trimesh]
+) -> list[pathlib.Path]:
+    """Files of surfaces whose format has colours: all but STL."""
+    paths = []
+    for file, mesh in zip(source.visuals, visual_meshes, strict=True):
+        if mesh.metadata["kind"] != "stl":
+            paths.append(file.path)
+    return paths
 
 
 def _object_of_scan(
@@ -248,7 +311,7 @@ def _surfaces(meshes: list[trimesh.Trimesh], solid: Enclosed | None, notes: list
 
 def _collision(
     source: Source,
-    own_pieces: Sequence[np.ndarray],
+    file_pieces: Sequence[np.ndarray],
     surfaces: Surfaces,
     options: ImportOptions,
     notes: list[str],
@@ -260,12 +323,20 @@ def _collision(
     """
     has_surface = bool(source.visuals)
     try:
-        return convex_pieces(own_pieces, surfaces, options, notes, has_surface=has_surface)
+        return convex_pieces(file_pieces, surfaces, options, notes, has_surface=has_surface)
     except QhullError:
         raise CongraspError(
             f"{source.path} has no volume: its points lie in a plane.",
             "Give it a thickness in a modelling program.",
         ) from None
+
+
+def _pieces(collision: Collision, center: np.ndarray) -> tuple[Piece, ...]:
+    """The convex pieces relative to the centre of mass (3,)."""
+    return tuple(
+        _piece(hull, center, owner)
+        for hull, owner in zip(collision.hulls, collision.owners, strict=True)
+    )
 
 
 def _piece(hull: np.ndarray, center: np.ndarray, part: int) -> Piece:
@@ -282,8 +353,7 @@ def _piece(hull: np.ndarray, center: np.ndarray, part: int) -> Piece:
 
 def _labels(
     source: Source,
-    meshes: Sequence[trimesh.Trimesh],
-    parts: Sequence[trimesh.Trimesh],
+    shape: _Shape,
     center: np.ndarray,
     points: np.ndarray,
     faces: np.ndarray,
@@ -292,17 +362,16 @@ def _labels(
 
     Args:
       source: the files.
-      meshes: the object's surfaces, m.
-      parts: those of its parts, unless they are the surfaces.
-      center: (3,) centre of mass, in the frame of the meshes.
+      shape: the surfaces of the object and of its parts.
+      center: (3,) centre of mass, in the frame of `shape`.
       points: (N, 3) surface points, relative to the centre of mass.
       faces: (N,) triangle of each surface point, among those of all surfaces.
     """
     if not source.parts:
         return _labels_of_halves(points)
-    if parts:
-        return _labels_of_parts(source, _nearest_part(parts, center, points))
-    return _labels_of_parts(source, _part_of_faces(meshes, faces))
+    if shape.parts:
+        return _labels_of_parts(source, _nearest_part(shape.parts, center, points))
+    return _labels_of_parts(source, _part_of_faces(shape.meshes, faces))
 
 
 def _labels_of_halves(points: np.ndarray) -> _Labels:

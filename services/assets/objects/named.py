@@ -126,30 +126,56 @@ def load_each(
         is skipped unless this raises.
       progress: called with the number of finished meshes.
     """
-    objects: dict[int, GraspObject] = {}
-    imported = [i for i, entry in enumerate(entries) if entry.source]
+    objects = _import_each(entries, options, on_error, progress)
+    objects.update(_generate_each(entries))
+    objects.update(_read_each(entries, on_error))
+    return [objects[i] for i in sorted(objects)]
+
+
+def _import_each(
+    entries: Sequence[ObjectAt],
+    options: ImportOptions,
+    on_error: Callable[[ObjectAt, CongraspError], None],
+    progress: Callable[[int], None],
+) -> dict[int, GraspObject]:
+    """Imports the meshes in parallel; returns the objects by their index among the entries."""
+    indices = [i for i, entry in enumerate(entries) if entry.source]
     sources = [entry.source for entry in entries if entry.source]
-    results = import_sources(sources, options) if sources else ()
-    for done, (place, result) in enumerate(results, 1):
-        i = imported[place]
+    if not sources:
+        return {}
+    objects: dict[int, GraspObject] = {}
+    for count, (place, result) in enumerate(import_sources(sources, options), 1):
+        index = indices[place]
         if isinstance(result, CongraspError):
-            on_error(entries[i], result)
+            on_error(entries[index], result)
             continue
         for note in result.notes:
             _log.warning("%s: %s", result.name, note)
-        objects[i] = result
-        progress(done)
-    generated = [i for i, entry in enumerate(entries) if entry.is_generated]
-    drawn = parallel_map(ObjectAt.load, [entries[i] for i in generated])
-    objects.update(zip(generated, drawn, strict=True))
+        objects[index] = result
+        progress(count)
+    return objects
+
+
+def _generate_each(entries: Sequence[ObjectAt]) -> dict[int, GraspObject]:
+    """Generates objects in parallel; returns them by their index among the entries."""
+    indices = [i for i, entry in enumerate(entries) if entry.is_generated]
+    objects = parallel_map(ObjectAt.load, [entries[i] for i in indices])
+    return dict(zip(indices, objects, strict=True))
+
+
+def _read_each(
+    entries: Sequence[ObjectAt], on_error: Callable[[ObjectAt, CongraspError], None]
+) -> dict[int, GraspObject]:
+    """Reads the object files; returns the objects by their index among the entries."""
+    objects: dict[int, GraspObject] = {}
     for i, entry in enumerate(entries):
         if entry.source or entry.is_generated:
             continue
         try:
-            objects[i] = entry.load(options)
+            objects[i] = entry.load()
         except CongraspError as error:
             on_error(entry, error)
-    return [objects[i] for i in sorted(objects)]
+    return objects
 
 
 def one_object(path: pathlib.Path, options: ImportOptions = _METRES_OR_ASK) -> GraspObject:

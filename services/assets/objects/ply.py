@@ -112,6 +112,29 @@ class _Header(NamedTuple):
         return total
 
 
+class _FaceLayout(NamedTuple):
+    """Layout of the faces in a binary file."""
+
+    start: int
+    """First byte of the first face."""
+    empty_bytes: int
+    """Bytes of a face without corners."""
+    corner_bytes: int
+    count_offset: int
+    """Bytes of a face before its number of corners."""
+    count_form: struct.Struct
+    """Type of the number of corners."""
+
+    def corner_count(self, content: bytes, start: int) -> int:
+        """Number of corners of the face that starts at a byte."""
+        (corners,) = self.count_form.unpack_from(content, start + self.count_offset)
+        return corners
+
+    def face_bytes(self, corners: int) -> int:
+        """Bytes of a face."""
+        return self.empty_bytes + corners * self.corner_bytes
+
+
 class _Body(NamedTuple):
     """The rows of the vertices and of the faces of a binary file."""
 
@@ -128,6 +151,24 @@ class _Body(NamedTuple):
     def vertices(self) -> np.ndarray:
         """Rows (V,) of the vertices."""
         return np.ndarray(self.vertex.rows, self.vertex.row_type(self.order), self.content)
+
+    def points(self) -> np.ndarray:
+        """Positions (V, 3) of the vertices."""
+        vertices = self.vertices()
+        return np.stack([vertices[axis] for axis in "xyz"], -1).astype(float)
+
+    def face_layout(self) -> _FaceLayout:
+        """Layout of the faces, which follow the vertices."""
+        empty_row = self.face.row_type(self.order)
+        one_corner_row = self.face.row_type(self.order, 1)
+        count_type, count_offset = dict(empty_row.fields or {})[_COUNT][:2]
+        return _FaceLayout(
+            start=self.vertices().nbytes,
+            empty_bytes=empty_row.itemsize,
+            corner_bytes=one_corner_row.itemsize - empty_row.itemsize,
+            count_offset=count_offset,
+            count_form=struct.Struct(self.order + count_type.char),
+        )
 
 
 def plain_ply(data: bytes, notes: list[str]) -> bytes:
@@ -154,7 +195,7 @@ def plain_ply(data: bytes, notes: list[str]) -> bytes:
         rows = max(element.rows for element in header.elements)
         raise ValueError(f"it announces {rows} rows, but has {len(data)} bytes")
     try:
-        return _with_triangles(data, header, notes) or data
+        return _with_triangles(data, header, notes)
     except struct.error:
         raise ValueError("a row lacks values that its header announces, or has others") from None
 
@@ -220,57 +261,72 @@ def _renamed_corners(element: _Element) -> re.Pattern[bytes] | None:
     return re.compile(rb"(\n\s*property\s+list(?:\s+\w+){2}\s+)" + re.escape(name))
 
 
-def _with_triangles(data: bytes, header: _Header, notes: list[str]) -> bytes | None:
-    """The file with triangles for its polygons; None if trimesh reads it unchanged.
+def _with_triangles(data: bytes, header: _Header, notes: list[str]) -> bytes:
+    """The file with triangles for its polygons.
 
-    That is a file of triangles alone, or of several lists; or one of an index out of range, which
-    the caller reports.
+    The file is returned unchanged if trimesh reads its faces (`_has_polygons`), if all of them are
+    triangles, and if a corner is out of range, which the caller reports.
     """
-    match header.elements:
-        case [_Element("vertex") as vertex, _Element("face") as face, *_] if face.rows:
-            pass
-        case _:
-            return None
-    if len(face.lists()) != 1 or vertex.lists():
-        return None
-    content = data[data.index(b"\n", len(header.text)) + 1 :]
-    if header.kind == "ascii":
-        body = _binary_body(content, vertex, face)
-    else:
-        body = _Body(header.kind, content, vertex, face)
+    if not _has_polygons(header.elements):
+        return data
+    body = _read_body(data, header)
     if body is None:
-        return None
-    (list_place,) = face.lists()
-    face.properties[list_place][3] = _CORNERS
-    vertices = body.vertices()
-    tables = _face_tables(body, vertices.nbytes)
-    corners = [table[_CORNERS].astype(int) for table in tables]
-    if all(polygons.shape[1] == 3 for polygons in corners):
-        return None
-    if any(polygons.min() < 0 or polygons.max() >= vertex.rows for polygons in corners):
-        return None
-    triangle_count = sum(len(polygons) * (polygons.shape[1] - 2) for polygons in corners)
-    triangle_type = face.row_type(body.order, 3)
+        return data
+    tables = _face_tables(body)
+    polygons = [table[_CORNERS].astype(int) for table in tables]
+    if all(corners.shape[1] == 3 for corners in polygons):
+        return data
+    if any(corners.min() < 0 or corners.max() >= body.vertex.rows for corners in polygons):
+        return data
+    triangle_count = sum(len(corners) * (corners.shape[1] - 2) for corners in polygons)
+    triangle_type = body.face.row_type(body.order, 3)
     if triangle_count * triangle_type.itemsize > _MAX_TRIANGLE_BYTES:
         limit = _MAX_TRIANGLE_BYTES >> 20
         raise ValueError(f"the triangles of its polygons take more than {limit} MB")
-    points = np.stack([vertices[axis] for axis in "xyz"], -1).astype(float)
-    cuts = cut_dented(points, corners, notes)
-    lines = [f"ply\nformat {body.kind} 1.0", *header.comments]
-    lines += vertex.header()
-    lines += face._replace(rows=triangle_count).header()
-    lines.append("end_header\n")
-    chunks = ["\n".join(lines).encode("latin-1"), body.content[: vertices.nbytes]]
-    for table, polygons, dented in zip(tables, corners, cuts, strict=True):
-        triangles = _triangle_rows(table, polygons, dented, triangle_type)
-        chunks.append(triangles.tobytes())
-    return b"".join(chunks)
+    cuts = cut_dented(body.points(), polygons, notes)
+    triangles = [
+        _triangle_rows(table, corners, dented, triangle_type)
+        for table, corners, dented in zip(tables, polygons, cuts, strict=True)
+    ]
+    return _triangle_file(body, header.comments, triangles)
+
+
+def _has_polygons(elements: list[_Element]) -> bool:
+    """True for a file of vertices and then faces, with the faces' corners as its only list."""
+    if [element.name for element in elements[:2]] != ["vertex", "face"]:
+        return False
+    vertex, face = elements[:2]
+    return face.rows > 0 and len(face.lists()) == 1 and not vertex.lists()
+
+
+def _read_body(data: bytes, header: _Header) -> _Body | None:
+    """The rows of a file's vertices and polygons; None for a text of triangles alone.
+
+    Args:
+      data: content of a file with polygons (`_has_polygons`).
+      header: its header.
+    """
+    vertex, face = header.elements[:2]
+    content = data[data.index(b"\n", len(header.text)) + 1 :]
+    if header.kind == "ascii":
+        return _binary_body(content, vertex, face)
+    (list_place,) = face.lists()
+    _, count_type, corner_type, _ = face.properties[list_place]
+    return _Body(header.kind, content, vertex, _with_corners(face, count_type, corner_type))
+
+
+def _with_corners(face: _Element, count_type: str, corner_type: str) -> _Element:
+    """The element of the faces with types for its list, which gets the name of corners."""
+    (list_place,) = face.lists()
+    properties = face.properties.copy()
+    properties[list_place] = ["list", count_type, corner_type, _CORNERS]
+    return face._replace(properties=properties)
 
 
 def _binary_body(content: bytes, vertex: _Element, face: _Element) -> _Body | None:
-    """The body of a text as that of a binary file; None if its faces are triangles alone.
+    """The rows of a text as those of a binary file, with integers in the faces' list.
 
-    The types of the face's list become integers.
+    None if all faces are triangles.
     """
     lines = [line for line in content.splitlines() if line.strip()][: vertex.rows + face.rows]
     vertex_lines = lines[: vertex.rows]
@@ -278,10 +334,28 @@ def _binary_body(content: bytes, vertex: _Element, face: _Element) -> _Body | No
     (list_place,) = face.lists()
     if all(float(line.split()[list_place]) == 3 for line in face_lines):
         return None
-    face.properties[list_place][1:3] = ["int", "int"]
+    face = _with_corners(face, "int", "int")
     rows = [vertex.binary_row(line) for line in vertex_lines]
     rows += [face.binary_row(line) for line in face_lines]
     return _Body("binary_little_endian", b"".join(rows), vertex, face)
+
+
+def _triangle_file(body: _Body, comments: list[str], triangles: list[np.ndarray]) -> bytes:
+    """A binary file of the body's vertices with triangles as its faces.
+
+    Args:
+      body: the vertices, and the element of the faces.
+      comments: lines of comments in the header.
+      triangles: (m, t) rows of the faces.
+    """
+    triangle_count = sum(rows.size for rows in triangles)
+    lines = [f"ply\nformat {body.kind} 1.0", *comments]
+    lines += body.vertex.header()
+    lines += body.face._replace(rows=triangle_count).header()
+    lines.append("end_header\n")
+    header = "\n".join(lines).encode("latin-1")
+    vertices = body.content[: body.vertices().nbytes]
+    return b"".join([header, vertices, *(rows.tobytes() for rows in triangles)])
 
 
 def _triangle_rows(
@@ -313,40 +387,54 @@ def _triangle_rows(
     return rows
 
 
-def _face_tables(body: _Body, start: int) -> list[np.ndarray]:
+def _face_tables(body: _Body) -> list[np.ndarray]:
     """Rows (m,) of the faces with three corners, of those with four, and so on.
-
-    Args:
-      body: the rows of the file.
-      start: byte at which the faces start.
 
     Raises:
       ValueError: the file ends within a face, or one has a negative number of corners.
     """
-    face = body.face
-    content = body.content
-    empty_row = face.row_type(body.order)
-    corner_bytes = face.row_type(body.order, 1).itemsize - empty_row.itemsize
-    count_type, count_offset = dict(empty_row.fields or {})[_COUNT][:2]
-    read_count = struct.Struct(body.order + count_type.char).unpack_from
-    (corners,) = read_count(content, start + count_offset)
-    end = start + face.rows * (empty_row.itemsize + corners * corner_bytes)
-    if corners > 2 and end <= len(content):
-        table = np.ndarray(face.rows, face.row_type(body.order, corners), content, start)
-        if (table[_COUNT] == corners).all():
-            return [table]
-    starts = np.empty(face.rows, int)
-    counts = np.empty(face.rows, int)
-    for row in range(face.rows):
-        (corners,) = read_count(content, start + count_offset)
-        starts[row] = start
-        counts[row] = corners
-        start += empty_row.itemsize + corners * corner_bytes
-    if counts.min() < 0 or start > len(content):
-        raise ValueError("it ends within a face, or one has a negative number of corners")
+    layout = body.face_layout()
+    table = _equal_faces(body, layout)
+    if table is not None:
+        return [table]
+    starts, counts = _find_faces(body, layout)
     tables = []
     for corners, rows in alike(counts):
-        row_type = face.row_type(body.order, corners)
-        windows = sliding_window_view(np.frombuffer(content, "u1"), row_type.itemsize)
+        row_type = body.face.row_type(body.order, corners)
+        windows = sliding_window_view(np.frombuffer(body.content, "u1"), row_type.itemsize)
         tables.append(windows[starts[rows]].view(row_type)[:, 0])
     return tables
+
+
+def _equal_faces(body: _Body, layout: _FaceLayout) -> np.ndarray | None:
+    """Rows (F,) of faces that all have as many corners; None if their numbers differ."""
+    face = body.face
+    corners = layout.corner_count(body.content, layout.start)
+    end = layout.start + face.rows * layout.face_bytes(corners)
+    if corners < 3 or end > len(body.content):
+        return None
+    row_type = face.row_type(body.order, corners)
+    table = np.ndarray(face.rows, row_type, body.content, layout.start)
+    if (table[_COUNT] != corners).any():
+        return None
+    return table
+
+
+def _find_faces(body: _Body, layout: _FaceLayout) -> tuple[np.ndarray, np.ndarray]:
+    """First bytes (F,) of the faces, and their numbers (F,) of corners.
+
+    Raises:
+      ValueError: see `_face_tables`.
+    """
+    face_count = body.face.rows
+    starts = np.empty(face_count, int)
+    counts = np.empty(face_count, int)
+    start = layout.start
+    for row in range(face_count):
+        corners = layout.corner_count(body.content, start)
+        starts[row] = start
+        counts[row] = corners
+        start += layout.face_bytes(corners)
+    if counts.min() < 0 or start > len(body.content):
+        raise ValueError("it ends within a face, or one has a negative number of corners")
+    return starts, counts

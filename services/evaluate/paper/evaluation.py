@@ -117,7 +117,7 @@ def evaluate_part(
         _tables(part, data),
         _pools(part, settings),
         partial_results,
-        keep=part.pictured,
+        keep=part.has_pictures,
     )
     source = _SOURCES.get(part.table, "hands")
     if data is not None:
@@ -230,7 +230,7 @@ def _draw_pictures(
     """Draws failures and successes of every row; returns title, caption and file of each
     picture.
     """
-    if not part.pictured:
+    if not part.has_pictures:
         return []
     sheets = failure_sheets(
         evaluation.experiment,

@@ -172,8 +172,8 @@ def paper_tables(cells: Sequence[Cell]) -> list[Table]:
 
 
 def _without_empty_columns(table: Table) -> Table:
-    """Returns a table without the columns of objects if it has none, and without those of errors
-    if the paper has none.
+    """Returns a table without the column of objects if that column is empty, and without both
+    columns of errors if the paper's is empty.
     """
     hidden = set[int]()
     if _is_empty(table, _OBJECTS_COLUMN):
@@ -272,8 +272,8 @@ def _titled_html(tables: Sequence[Table]) -> list[tuple[str, str]]:
 
 
 def _differences(results: Sequence[PartResult]) -> list[str]:
-    """Differences that apply to every table, and for each hand the share of headings that its rules
-    keep.
+    """Differences that apply to every table, then the share of headings kept by the rules of each
+    hand.
     """
     heading_rules = [result.about["heading_rules"] for result in results]
     return [*_DIFFERENCES, *dict.fromkeys(filter(None, heading_rules))]

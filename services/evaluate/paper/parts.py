@@ -36,8 +36,8 @@ class Part(NamedTuple):
         return self.data.resolve().name
 
     @property
-    def pictured(self) -> bool:
-        """True if episodes are drawn: those of the full system, under constraints without noise."""
+    def has_pictures(self) -> bool:
+        """True if episodes are drawn: for the full system, under constraints without noise."""
         return self.policy.method == "ours" and self.table not in _TABLES_WITHOUT_PICTURES
 
 
@@ -45,7 +45,7 @@ def required_policies(hands: Sequence[str], methods: Sequence[str]) -> list[Poli
     """Returns the policies of a reproduction, including those of methods without learning.
 
     Args:
-      hands: hands of the full system; the first is that of all other methods.
+      hands: hands of the full system; the first is used by all other methods.
       methods: some of `BASELINES`.
 
     Returns:

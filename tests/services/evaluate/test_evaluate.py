@@ -40,7 +40,7 @@ def cache(tmp_path_factory):
     """Folder of the references: few attempts, in small batches; and of the bank."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        patch.setattr(bank_cache, "LEAST_OBJECTS", 1)
+        patch.setattr(bank_cache, "MIN_OBJECTS", 1)
         patch.setattr(references, "MAX_ATTEMPTS", 2)
         patch.setattr(references, "ENGINES", {"native": types.SimpleNamespace(batch=8)})
         yield

@@ -129,7 +129,7 @@ def test_every_browser_has_a_separate_session(monkeypatch: pytest.MonkeyPatch) -
     """A cookie identifies it, edits and undo are separate, and beyond the limit the least recent
     idle one ends.
     """
-    monkeypatch.setattr(browser_sessions, "MOST", 2)
+    monkeypatch.setattr(browser_sessions, "MAX_SESSIONS", 2)
     sessions_made: list[Session] = []
 
     def new() -> Session:
@@ -166,7 +166,7 @@ def test_every_browser_has_a_separate_session(monkeypatch: pytest.MonkeyPatch) -
             )
             assert "2 browsers, the maximum, use" in refused["error"]
             assert len(sessions_made) == 2
-        monkeypatch.setattr(browser_sessions, "IDLE", 0.0)
+        monkeypatch.setattr(browser_sessions, "IDLE_S", 0.0)
         assert not undoable(cookies[2])
         assert len(sessions_made) == 3
         assert undoable(cookies[0])

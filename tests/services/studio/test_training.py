@@ -25,7 +25,7 @@ from congrasp.services.studio.training import (
     Follower,
     TrainingWindow,
     labels_of,
-    opened_window,
+    open_window,
 )
 from tests import studio as fake
 from tests.studio import BEGIN, DIP
@@ -292,7 +292,7 @@ def test_a_window_has_the_name_of_the_run_or_of_the_recordings_folder(
         ("r", tmp_path / "mine", "r"),
         ("", None, ""),
     ):
-        assert opened_window(run, folder).run == name
+        assert open_window(run, folder).run == name
 
 
 def test_a_finished_run_stays_finished_when_its_learner_has_gone() -> None:
