@@ -92,7 +92,7 @@ def logged_stages(log: pathlib.Path, began: float) -> list[Stage]:
     if not log.is_file():
         return []
     logged: list[Stage] = []
-    for name, seconds, ended in _PATTERN.findall(log.read_text(errors="replace")):
+    for name, seconds, ended in _PATTERN.findall(log.read_text(encoding="utf-8", errors="replace")):
         if name == _IMPORTS:
             logged.clear()
         logged.append(Stage(name, began + float(ended) - float(seconds), began + float(ended)))

@@ -75,6 +75,6 @@ def test_a_client_of_another_address_is_served_when_full(monkeypatch):
         for _ in range(PLACES):
             crowd = bare_session("client", connect=f"{endpoint}#bind=127.0.0.2:0")
             stack.callback(crowd.close)
-        client = ZenohTransport(connect=[endpoint], flows=("policy",), wait=20.0)
+        client = ZenohTransport(connect=[endpoint], flows=("policy",), wait=90.0)
         stack.enter_context(client)
-        assert client.query(KEYS.health, Message(), timeout=10.0).meta == {"ready": True}
+        assert client.query(KEYS.health, Message(), timeout=60.0).meta == {"ready": True}
