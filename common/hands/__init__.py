@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.hands.files import HUMAN, MAX_BYTES, hand_from_text, read_hand, shipped_hand
-from congrasp.common.hands.left import left_hand, right_name
+from congrasp.common.hands.left import LEFT, SIDE, left_hand
 from congrasp.common.hands.mano import own_mano_hand
 from congrasp.common.hands.spec import Hand
 from congrasp.common.io.files import user_folder
@@ -37,6 +37,20 @@ def hands_folder() -> pathlib.Path:
     return pathlib.Path(
         os.environ.get(VARIABLE) or user_folder("XDG_CONFIG_HOME", ".config") / "congrasp" / "hands"
     )
+
+
+def right_name(name: str) -> tuple[str, bool]:
+    """Splits a hand's name into the name of the right hand, and True if it names the left one.
+
+    `NAME:left` is the left one of any hand or policy, but `NAME_left` only of a built-in hand:
+    other names may end so.
+    """
+    if name.endswith(SIDE):
+        return name.removesuffix(SIDE), True
+    right = name.removesuffix(LEFT)
+    if right != name and right in HANDS:
+        return right, True
+    return name, False
 
 
 def check_reference(reference: object) -> str:

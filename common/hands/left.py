@@ -1,4 +1,4 @@
-"""Left hands: mirror images of right ones, and their names."""
+"""Left hands: mirror images of right ones."""
 
 import dataclasses
 import functools
@@ -7,22 +7,17 @@ from congrasp.common import mirror
 from congrasp.common.hands.spec import Capsule, Hand, Joint, Link, Solid, Vector, vector
 
 LEFT = "_left"
-"""Ends the name of a left hand."""
+"""End of the name of a left hand."""
 SIDE = ":left"
-"""The same, as a user may write it."""
-
-
-def right_name(name: str) -> tuple[str, bool]:
-    """Returns the right hand's name within a name, and True if that is a left hand's."""
-    for ending in (SIDE, LEFT):
-        if name.endswith(ending):
-            return name.removesuffix(ending), True
-    return name, False
+"""The same end, as a user may write it."""
 
 
 @functools.cache
 def left_hand(hand: Hand) -> Hand:
-    """Returns the left hand of a right one, with the same names, angles, limits and gains."""
+    """Returns the left hand of a right one, with the same angles, limits and gains.
+
+    Its links and joints have the same names.
+    """
     links = tuple(_mirrored_link(link) for link in hand.links)
     return dataclasses.replace(hand, name=hand.name + LEFT, links=links)
 

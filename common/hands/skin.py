@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from congrasp.common import mirror
+from congrasp.common.hands import right_name
 from congrasp.common.hands.flesh import Skeleton, Surface, flesh, skeleton_of
 from congrasp.common.hands.housings import housings
-from congrasp.common.hands.left import right_name
 from congrasp.common.hands.meshes import Meshes, own_meshes
 from congrasp.common.hands.nails import nails
 from congrasp.common.hands.sleeve import sleeve

@@ -9,7 +9,14 @@ import tyro
 
 from congrasp.actors.physics import PhysicsName
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands import HANDS, SUFFIX, get_hand, hands_folder, own_hands
+from congrasp.common.hands import (
+    HANDS,
+    SUFFIX,
+    get_hand,
+    hands_folder,
+    own_hands,
+    right_name,
+)
 from congrasp.common.hands.files import hand_text
 from congrasp.common.hands.meshes import load_meshes, save_meshes
 from congrasp.common.io.files import check_output, write_atomically
@@ -197,7 +204,8 @@ def _store(
     from congrasp.services.viz.sheets import save_png
 
     hand = proposal.hand
-    if hand.name in HANDS:
+    is_hidden = out is None and right_name(hand.name)[0] in HANDS  # names of left hands, too
+    if hand.name in HANDS or is_hidden:
         raise CongraspError(
             f"'{hand.name}' is the name of a hand of congrasp.", "Pass another --name."
         )

@@ -14,7 +14,7 @@ from congrasp.actors.initial import RequestedEpisodes
 from congrasp.common.episode.mirrored import mirrored_episode
 from congrasp.common.errors import CongraspError, ContradictionError
 from congrasp.common.hands import get_hand
-from congrasp.common.hands.left import LEFT
+from congrasp.common.hands.left import SIDE
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import PolicyBundle
@@ -169,7 +169,7 @@ class Grasper:
         self._arm = arm
         self._hand = get_hand(policy.spec.hand)
         self.left = left
-        self.hand = get_hand(self._hand.name + LEFT) if left else self._hand
+        self.hand = get_hand(self._hand.name + SIDE) if left else self._hand
         self.task = policy.task.evaluated()
         self._policy = policy
         self._attempts_count = attempts

@@ -7,8 +7,7 @@ from typing import Any
 
 from congrasp.actors.attempts import PLAIN, Phases
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands import get_hand
-from congrasp.common.hands.left import right_name
+from congrasp.common.hands import get_hand, right_name
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file

@@ -14,8 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from congrasp.common.errors import CongraspError, ContradictionError, error_of
-from congrasp.common.hands import get_hand
-from congrasp.common.hands.left import right_name
+from congrasp.common.hands import get_hand, right_name
 from congrasp.common.hands.spec import Hand
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.bundle import InferenceParameters, PolicyBundle, mean_action

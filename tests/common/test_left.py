@@ -1,5 +1,6 @@
 """Left hands: mirror images of right ones in kinematics, surface, objects and policies."""
 
+import dataclasses
 from unittest import mock
 
 import mujoco
@@ -7,15 +8,24 @@ import numpy as np
 import pytest
 
 from congrasp.common import mirror
+from congrasp.common.config import NetworkConfig, RunConfig
 from congrasp.common.errors import CongraspError
-from congrasp.common.hands import get_hand, known_hand
+from congrasp.common.hands import VARIABLE, get_hand, known_hand, right_name
+from congrasp.common.hands.files import hand_text
 from congrasp.common.hands.mjcf import add_hand
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.objects.procedural import generate
 from congrasp.common.objects.shapes import mesh_of
+from congrasp.common.policy import bundle as bundles
+from congrasp.common.policy.pretrained import own_policy_file
 from congrasp.common.request import GraspRequest
+from congrasp.common.task.config import TaskConfig
 from congrasp.services.client.left_policy import LeftPolicy, mirrored_request
 from congrasp.services.client.policy import Answer
+from congrasp.services.grasp.grasper import Grasper
+from congrasp.services.grasp.interface import open_grasper
+from congrasp.services.serve.inference import LocalPolicy, load_policy
+from congrasp.services.train.command import untrained
 
 SIDES = np.diag([-1.0, 1.0, 1.0])
 
@@ -52,6 +62,36 @@ def test_a_left_hand_is_one_object_by_either_name_and_messages_may_name_it():
     assert get_hand("human:left").reference == "human_left"
     with pytest.raises(CongraspError, match="no hand 'paw:left'"):
         get_hand("paw:left")
+
+
+def test_names_of_left_hands():
+    assert right_name("human_left") == right_name("human:left") == ("human", True)
+    assert right_name("human") == ("human", False)
+    assert right_name("runs/mug_left") == ("runs/mug_left", False)
+    assert right_name("runs/mug:left") == ("runs/mug", True)
+
+
+def test_a_custom_hand_named_left_has_its_own_policy(tmp_path, monkeypatch):
+    monkeypatch.setenv(VARIABLE, str(tmp_path))
+    get_hand.cache_clear()
+    bundles_by_name = {}
+    for name in ("paw", "paw_left"):
+        hand = dataclasses.replace(get_hand("human"), name=name)
+        (tmp_path / f"{name}.json").write_text(hand_text(hand))
+        task = TaskConfig(hand=get_hand(name).reference, constraints=("heading",))
+        config = RunConfig(task=task, network=NetworkConfig(hidden=(8,), encoder=4))
+        bundles_by_name[name] = untrained(config)
+        bundles.save(bundles_by_name[name], own_policy_file(name))
+    grasper = open_grasper(None, "paw_left", attempts=1)
+    assert grasper.hand is get_hand("paw_left")
+    assert not grasper.left
+    with load_policy("paw_left") as policy:
+        assert isinstance(policy, LocalPolicy)
+        assert policy.metadata()["hand"] == "paw_left"
+    # The mirror image of a custom hand is not the custom hand of a similar name.
+    with pytest.raises(CongraspError, match="no hand 'paw:left'"):
+        Grasper(bundles_by_name["paw"], attempts=1, left=True)
+    get_hand.cache_clear()
 
 
 def test_the_surface_of_a_left_hand_is_closed_to_the_outside_and_mirrored():
