@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import pathlib
-import xml.etree.ElementTree as ET
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +14,7 @@ from congrasp.common.runtime.physics_library import mujoco
 from congrasp.services.assets.hands.compile import robot_spec
 from congrasp.services.assets.hands.reading import confined
 from congrasp.services.assets.hands.robot_texts import robot_text
+from congrasp.services.assets.hands.urdf import parse_urdf
 
 SPEED = 3.14
 """Default speed limit of joints, rad/s (m/s of slides); MJCF files never have one."""
@@ -316,7 +316,7 @@ def _urdf_speeds(text: str) -> dict[str | None, float]:
     speeds: dict[str | None, float] = {}
     if not text.startswith("<robot"):
         return speeds
-    for joint in ET.fromstring(text).iter("joint"):
+    for joint in parse_urdf(text).findall("joint"):
         limit = joint.find("limit")
         speeds[joint.get("name")] = 0.0 if limit is None else float(limit.get("velocity", 0.0))
     return speeds

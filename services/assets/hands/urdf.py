@@ -86,7 +86,7 @@ def urdf_spec(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
     Raises:
       ValueError: it cannot be read.
     """
-    robot = _parsed(text)
+    robot = parse_urdf(text)
     extension = _child(robot, "mujoco")
     _child(extension, "compiler").attrib.update(_COMPILER)
     _check_names(robot)
@@ -100,8 +100,14 @@ def urdf_spec(path: pathlib.Path, text: str, notes: list[str]) -> mujoco.MjSpec:
     return mujoco.MjSpec.from_string(ET.tostring(robot, "unicode"), assets=meshes.assets)
 
 
-def _parsed(text: str) -> ET.Element:
-    """The root element; as in ROS, prefixes need no declaration, which ElementTree requires."""
+def parse_urdf(text: str) -> ET.Element:
+    """Returns the root element of a URDF's text.
+
+    As in ROS, prefixes need no declaration, which ElementTree requires.
+
+    Raises:
+      ValueError: it is not XML.
+    """
     builder = ET.TreeBuilder()
     parser = xml.parsers.expat.ParserCreate()
     parser.StartElementHandler = builder.start

@@ -252,6 +252,27 @@ def test_limits_of_a_urdf_and_of_the_user(folder):
         load_arm(path, flange="wrist")
 
 
+@pytest.mark.parametrize(
+    "extension",
+    [
+        '<transmission name="t"><joint name="bj"/><actuator name="m"/></transmission>'
+        '<ros2_control name="c" type="system"><joint name="bj"/></ros2_control>',
+        '<gazebo><controller:camera name="x"/></gazebo>',
+    ],
+    ids=["joints of drives", "undeclared prefix"],
+)
+def test_speeds_of_a_urdf_with_extensions(folder, extension):
+    inertia = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1"/></inertial>'
+    path = folder / "driven.urdf"
+    path.write_text(
+        f'<robot name="driven"><link name="a">{inertia}</link><link name="b">{inertia}</link>'
+        '<joint name="bj" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>'
+        '<limit lower="-1" upper="1" effort="9" velocity="1.5"/></joint>'
+        f"{extension}</robot>"
+    )
+    np.testing.assert_allclose(load_arm(path).speed, [1.5])
+
+
 def test_a_name_needs_the_package_and_the_network(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "mujoco_menagerie", None)
     with pytest.raises(MissingPackageError, match=r"pip install 'congrasp\[arm\]'"):
