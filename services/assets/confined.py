@@ -24,6 +24,8 @@ from congrasp.common.runtime.process_variables import child_environment
 from congrasp.services.ops import causes
 
 _ANSWER = "answer.json"
+_WRITE_FAILED = 74
+"""Exit code of a child that cannot write its answer."""
 _STARTED = "started"
 """File that the child creates once its imports are done."""
 _MODULE = "congrasp.services.assets.confined"
@@ -54,6 +56,8 @@ def call_confined(
     """Calls a function of a module in a child process.
 
     Processor time is limited, so that the load of the machine affects the time, but not the result.
+    The messages of the ChildProcessErrors are phrases without a subject, such as "took longer than
+    30 s of processor time".
 
     Args:
       function: called as function(folder, **options); returns what JSON takes.
@@ -69,8 +73,7 @@ def call_confined(
       TimeoutError: it did not end within `patience`.
       OutOfResources: it reached its limit of processor time or memory, or the system killed it.
       EnvironmentFailure: it did not start, or failed for a reason that is not the function's.
-      ChildProcessError: it ended without an answer; the message, a predicate, states the reason, as
-        it does for the two errors above.
+      ChildProcessError: it ended without an answer.
     """
     env = child_environment(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", JAX_PLATFORMS="cpu")
     called = f"{function.__module__}:{function.__name__}"
@@ -81,10 +84,10 @@ def call_confined(
             [sys.executable, "-P", "-m", _MODULE, *arguments],
             limits,
             env,
-            "stderr",
-            json.dumps(options).encode(),
+            stream="stderr",
+            data=json.dumps(options).encode(),
         )
-    except TimeoutError:
+    except TimeoutError:  # which is an OSError, too
         raise
     except OSError as error:
         raise EnvironmentFailure(f"did not start ({error.strerror})") from None
@@ -116,8 +119,10 @@ def _failure(folder: pathlib.Path, code: int, output: str) -> ChildProcessError:
     reason = causes.cause_in(output) or causes.last_line(output) or f"exit code {code}"
     if not (folder / _STARTED).exists():
         return EnvironmentFailure(f"did not start ({reason})")
-    if code == 0:  # where the ends of children are ignored, their exit codes are lost
+    if code == 0:  # `subprocess` reports 0 for every child while SIGCHLD is ignored
         return EnvironmentFailure("ended without an answer")
+    if code == _WRITE_FAILED:
+        return EnvironmentFailure(f"failed ({reason})")
     if -code in _FROM_OUTSIDE:
         return EnvironmentFailure(f"was ended by {signal.Signals(-code).name}")
     if causes.is_shortage(output):
@@ -141,9 +146,14 @@ def _child(
         answer = {"result": function(pathlib.Path(folder), **options)}
     except CongraspError as error:
         answer = {"error": str(error)}
-    except (ImportError, OSError) as error:
+    except (ImportError, OSError) as error:  # a fault of the input is a CongraspError
         answer = {"environment": f"{type(error).__name__}: {error}"}
-    pathlib.Path(folder, _ANSWER).write_text(json.dumps(answer), encoding="utf-8")
+    text = json.dumps(answer)
+    try:
+        pathlib.Path(folder, _ANSWER).write_text(text, encoding="utf-8")
+    except OSError as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        sys.exit(_WRITE_FAILED)
 
 
 if __name__ == "__main__":

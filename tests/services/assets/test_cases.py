@@ -31,8 +31,11 @@ import pytest
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import shapes, store
 from congrasp.services.arm.description import load_arm
+from congrasp.services.assets.confined import EnvironmentFailure, call_confined
 from congrasp.services.assets.hands import model_files, reading
 from congrasp.services.assets.hands.model_files import import_hand
+from congrasp.services.assets.hands.reading import FaultyFile
+from congrasp.services.assets.hands.robot_texts import read_texts
 from congrasp.services.cli import main
 from congrasp.services.viz import hand_sheets
 from tests.services.conftest import quick_imports
@@ -168,3 +171,55 @@ def test_a_pipe_among_the_files_of_a_description_is_not_opened(tmp_path):
         CongraspError, match=r"'more\.xml' that it names is no regular file\. Name one"
     ):
         model_files.propose(tmp_path / "hand.xml")
+
+
+@pytest.mark.parametrize(
+    ("texts", "pipe"),
+    [
+        (['<texture type="cube" fileright="a.png" fileleft="pipe"/>'], "pipe"),
+        (
+            [
+                '<compiler meshdir="meshes"/><include file="sub/more.xml"/>',
+                '<asset><mesh file="pipe"/></asset>',
+            ],
+            "meshes/pipe",
+        ),
+        (
+            [
+                '<asset><model file="sub/more.xml"/></asset>',
+                '<compiler meshdir="meshes"/><asset><mesh file="pipe"/></asset>',
+            ],
+            "sub/meshes/pipe",
+        ),
+    ],
+    ids=["second attribute", "include", "attached model"],
+)
+def test_pipes_are_recognised_wherever_mujoco_searches(tmp_path, texts, pipe):
+    for name, text in zip(("hand.xml", "sub/more.xml"), texts, strict=False):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(f"<mujoco>{text}</mujoco>")
+    (tmp_path / pipe).parent.mkdir(exist_ok=True)
+    os.mkfifo(tmp_path / pipe)
+    with pytest.raises(FaultyFile, match="'pipe' that it names is no regular file"):
+        read_texts(tmp_path / "hand.xml")
+
+
+@pytest.mark.parametrize("count", [300, 301])
+def test_the_number_of_included_files_is_limited(tmp_path, count):
+    names = [f"{number}.xml" for number in range(count)]
+    for name in names:
+        (tmp_path / name).write_text("<mujoco/>")
+    includes = "".join(f'<include file="{name}"/>' for name in names)
+    (tmp_path / "hand.xml").write_text(f"<mujoco>{includes}</mujoco>")
+    if count > 300:
+        with pytest.raises(ValueError, match="more than 300 files"):
+            read_texts(tmp_path / "hand.xml")
+        return
+    assert list(read_texts(tmp_path / "hand.xml").included) == names
+
+
+def test_an_answer_that_cannot_be_written_is_an_environment_error(tmp_path):
+    """As on a full disk: a folder has the name of the answer's file."""
+    (tmp_path / "answer.json").mkdir()
+    with pytest.raises(EnvironmentFailure, match=r"^failed \(IsADirectoryError: "):
+        call_confined(os.path.basename, tmp_path, {}, memory=1 << 30, seconds=30.0, patience=300.0)
