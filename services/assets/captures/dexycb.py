@@ -26,8 +26,8 @@ from congrasp.services.assets.captures.sequence import (
     Sequence,
     frames_of,
     is_unit,
-    known_frames,
     read_or_drop,
+    with_gaps_filled,
 )
 
 _MAX_YAML_BYTES = 64 << 10
@@ -130,7 +130,7 @@ def _read_sequence(name: str, folder: pathlib.Path, data_set: _DataSet) -> Seque
     has_object = np.isfinite(object_pose).all(-1) & has_position & is_unit(object_pose[:, :4])
     has_hand = np.isfinite(hand).all(-1) & (hand != 0).any(-1)
     present = has_object & has_hand
-    object_pose, hand = known_frames(name, present, object_pose, hand)
+    object_pose, hand = with_gaps_filled(name, present, object_pose, hand)
     calibration = _value(name, meta, "mano_calib")[0]
     skeleton = human.skeleton(model, calibrated_shape(name, data_set.root, calibration))
     angles = model.hand_mean + hand[:, 3:48] @ model.components

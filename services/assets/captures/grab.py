@@ -23,8 +23,8 @@ from congrasp.services.assets.captures.sequence import (
     Meshes,
     Sequence,
     frames_of,
-    known_frames,
     read_or_drop,
+    with_gaps_filled,
 )
 
 HOLDS = "s1/*.npz and the other subjects"
@@ -112,7 +112,7 @@ def _read_sequence(name: str, file: pathlib.Path, data_set: _DataSet) -> Sequenc
     skeleton = _skeleton(data_set.model, hand_template(data_set.root, data))
     frame_count = len(arrays[0])
     present = np.isfinite(np.concatenate(arrays, 1)).all(-1)
-    fields = dict(zip(shapes, known_frames(name, present, *arrays), strict=True))
+    fields = dict(zip(shapes, with_gaps_filled(name, present, *arrays), strict=True))
     finger_rotations = fields[_FINGER_ROTATIONS].reshape(-1, 15, 3)
     wrist, joints = skeleton.posed(
         Rotation.from_rotvec(fields[_WRIST_ROTATION]), Rotation.from_rotvec(finger_rotations)

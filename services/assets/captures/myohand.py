@@ -3,9 +3,9 @@
 `time (T,)` s; `robot (T, 29)`: three slides (m), three hinges, pronation, deviation and wrist
 flexion, then the twenty finger joints in the order of the `human` hand (rad); `object (T, 7)`:
 position (m) and quaternion (w, x, y, z). A file is named `MyoHand_<object>_<action>.npz`. The arm
-is MyoHand's at its table (Apache-2.0, MyoHub): slides and hinges move a base in front of the table,
-to which shoulder, elbow and forearm connect the wrist rigidly. The object's slides are relative to
-a point above the table's centre.
+is MyoHand's at its table (Apache-2.0, MyoHub): slides and hinges move a base in front of the table.
+Shoulder and elbow do not bend, so that only pronation, deviation and flexion move the wrist in the
+base. The object's slides are relative to a point above the table's centre.
 """
 
 import pathlib
@@ -24,23 +24,25 @@ from congrasp.services.assets.captures.sequence import (
     Sequence,
     frames_of,
     is_unit,
-    known_frames,
     read_or_drop,
+    with_gaps_filled,
 )
 
 HOLDS = "MyoHand_<object>_<action>.npz"
 _BASE = np.array([0.1, -0.55, 0.32])
-"""Position of MyoHand's base, m, world frame; the following are m, too."""
+"""Position of MyoHand's base, m, world frame."""
 _ELBOW = np.array([0.002797970, 0.304212085, -0.000513865])
-"""Origin of the forearm in the base."""
+"""Origin of the forearm, m, in the base."""
 _FOREARM = Rotation.from_quat(
     [0.000281544, 0.707106501, -0.000281544, 0.707106949], scalar_first=True
 )
+"""Orientation of the forearm in the base at a pronation of 0."""
 _PRONATION = np.array([-0.017161, 0.992666, -0.119668])
+"""Axis of the pronation in the forearm; its length is about 1."""
 _WRIST = np.array([0.018, -0.242, 0.025])
-"""Position of the wrist in the forearm."""
+"""Position of the wrist, m, in the forearm."""
 _OBJECT = np.array([0.0, 0.0, 0.035])
-"""Position of the object while its slides are zero."""
+"""Position of the object, m, world frame, while its slides are zero."""
 _MAX_ANGLE_RAD = 2 * np.pi
 
 
@@ -52,19 +54,21 @@ def read(
         yield read_or_drop(file.stem, _sequence, file, meshes)
 
 
-def wrist_pose(robot: np.ndarray) -> tuple[np.ndarray, Rotation]:
-    """World positions (T, 3) and orientations of the wrist for MyoHand's first nine joints (T,
-    9).
+def wrist_pose(arm_joints: np.ndarray) -> tuple[np.ndarray, Rotation]:
+    """World positions (T, 3), m, and orientations of the wrist.
+
+    Args:
+      arm_joints: (T, 9) slides (m), hinges, pronation, deviation and flexion (rad).
     """
-    arm = Rotation.from_euler("XYZ", robot[:, 3:6])
+    arm = Rotation.from_euler("XYZ", arm_joints[:, 3:6])
     axis = _PRONATION / np.linalg.norm(_PRONATION)
-    forearm = arm * _FOREARM * Rotation.from_rotvec(robot[:, 6:7] * axis)
+    forearm = arm * _FOREARM * Rotation.from_rotvec(arm_joints[:, 6:7] * axis)
     wrist = (
         forearm
-        * Rotation.from_rotvec(robot[:, 7:8] * [0, 0, 1])
-        * Rotation.from_rotvec(robot[:, 8:9] * [1, 0, 0])
+        * Rotation.from_rotvec(arm_joints[:, 7:8] * [0, 0, 1])
+        * Rotation.from_rotvec(arm_joints[:, 8:9] * [1, 0, 0])
     )
-    return _BASE + robot[:, :3] + arm.apply(_ELBOW) + forearm.apply(_WRIST), wrist
+    return _BASE + arm_joints[:, :3] + arm.apply(_ELBOW) + forearm.apply(_WRIST), wrist
 
 
 def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
@@ -73,7 +77,7 @@ def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
     time, robot, pose = frames_of(
         name, "the file", read_archive(file), {"time": (), "robot": (29,), "object": (7,)}
     )
-    if runs_back(time).any():
+    if runs_back(time).any():  # only its order matters: a `Sequence` has no times
         raise Dropped(
             name,
             "wrong layout",
@@ -83,7 +87,7 @@ def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
     if not present.any():
         reason = "no frame has finite joints and an object with a unit quaternion (w, x, y, z)"
         raise Dropped(name, "frames missing", reason)
-    robot, pose = known_frames(name, present, robot, pose)
+    robot, pose = with_gaps_filled(name, present, robot, pose)
     largest = float(np.abs(robot[:, 3:]).max())
     if largest > _MAX_ANGLE_RAD:
         raise Dropped(
@@ -91,7 +95,7 @@ def _sequence(file: pathlib.Path, meshes: Meshes) -> Sequence:
             "wrong units",
             f"a joint angle is {largest:.4g}: check that angles are in radians",
         )
-    position, rotation = wrist_pose(robot)
+    position, rotation = wrist_pose(robot[:, :9])
     object_name = name.removeprefix("MyoHand_").rsplit("_", 1)[0]
     return Sequence(
         name=name,

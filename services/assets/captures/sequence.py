@@ -1,6 +1,6 @@
 """Output of importers: a captured grasp of one object by a right hand, in any world frame, m.
 
-Importers share `frames_of`, `array_of`, `known_frames` and `Meshes`.
+Importers share `frames_of`, `array_of`, `with_gaps_filled` and `Meshes`.
 
 The wrist frame is that of the `human` hand: its origin at the wrist, fingers towards -y, the
 thumb's side +x, the back of the hand +z.
@@ -194,7 +194,7 @@ def is_unit(quaternions: np.ndarray) -> np.ndarray:
     return np.abs(np.linalg.norm(quaternions, axis=-1) - 1) < _UNIT_TOLERANCE
 
 
-def known_frames(name: str, present: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:
+def with_gaps_filled(name: str, present: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:
     """Returns arrays (T, ...) with the first known frame in place of missing ones.
 
     Raises:

@@ -22,7 +22,7 @@ _MIN_RECORDS = 4
 _UNIT_TOLERANCE = 1e-3
 """Largest deviation of a normal's length from 1."""
 _MIN_PROPER_SHARE = 0.5
-"""Share of records with an area, from which bytes are taken for triangles."""
+"""Bytes are triangles if more than this share of their records has an area."""
 _MAX_SIZE_RATIO = 100
 """Largest coordinate of additional records, relative to that of the announced ones."""
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
@@ -86,7 +86,7 @@ def _holds_records(start: bytes) -> bool:
     lengths = np.linalg.norm(records["normal"].astype(float), axis=-1)
     if not (np.abs(lengths - 1) < _UNIT_TOLERANCE).all():
         return False
-    return _are_plausible(records, records)
+    return _are_plausible(records, records)  # no count is known, so no other record is sound
 
 
 def _whole_records(data: bytes) -> int:
@@ -105,7 +105,11 @@ def _text_corners(data: bytes) -> np.ndarray:
 
 
 def _binary_corners(data: bytes, notes: list[str]) -> np.ndarray:
-    """Corners (F, 3, 3) of records: of whole and plausible ones if the header's count is wrong."""
+    """Corners (F, 3, 3) of the announced records.
+
+    If the header's count is wrong, they are those of all whole records, provided that those beyond
+    it are plausible.
+    """
     announced = _announced_triangles(data)
     count = _whole_records(data)
     if not count:
@@ -113,7 +117,8 @@ def _binary_corners(data: bytes, notes: list[str]) -> np.ndarray:
             "it has no triangles: neither text with 'facet' in it, nor whole binary records"
         )
     records = np.frombuffer(data, _RECORD, count, _HEADER_BYTES)
-    if announced < count and not _are_plausible(records[announced:], records[: announced or count]):
+    sound = records[:announced] if announced else records
+    if announced < count and not _are_plausible(records[announced:], sound):
         count = announced
     surplus_bytes = len(data) - _HEADER_BYTES - _TRIANGLE_BYTES * count
     if count != announced:
