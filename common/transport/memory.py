@@ -1,7 +1,8 @@
-"""In-process transport: the same behaviour as over the wire, without copies.
+"""In-process transport, without copies.
 
-Arrays may stay on a device. All endpoints of a `MemoryHub` see each other. A `PairTransport`
-combines two transports, for a learner with an actor in its process.
+It behaves as over the wire, except that the option `fair` of `serve` has no effect. Arrays may
+stay on a device. All endpoints of a `MemoryHub` see each other. A `PairTransport` combines two
+transports, for a learner with an actor in its process.
 """
 
 import contextlib
@@ -41,7 +42,10 @@ class _Question(NamedTuple):
 
 class _Server(NamedTuple):
     key: str
-    questions: "queue.Queue[_Question | None]"
+    questions: "queue.SimpleQueue[_Question | None]"
+    """Queued queries; None ends one worker."""
+    places: threading.Semaphore
+    """Free places in the queue. A query takes one before it is queued."""
     workers: int
     ended: threading.Event
 
@@ -95,9 +99,16 @@ class MemoryTransport(Transport):
         admission: Admission | None = None,
         fair: bool = False,
     ) -> None:
-        """See `Transport.serve`; messages are never damaged here."""
+        """See `Transport.serve`.
+
+        `on_damage` is never called: messages are not encoded. `fair` has no effect: queries are
+        answered in the order of their arrival, and those in excess of `depth` wait at their
+        senders.
+        """
         self._check_open()
-        server = _Server(key, queue.Queue(depth), workers, threading.Event())
+        server = _Server(
+            key, queue.SimpleQueue(), threading.Semaphore(depth), workers, threading.Event()
+        )
         with self._hub.lock:
             self._hub.servers.append(server)
         self._servers.append(server)
@@ -117,17 +128,23 @@ class MemoryTransport(Transport):
                 f"No response for {key}.",
                 "The process that serves it may have ended, or has another name.",
             )
+        if not server.places.acquire(timeout=timeout):
+            raise _late(key, timeout)
         question = _Question(key, request, Future())
+        server.questions.put(question)
+        if server.ended.is_set():
+            # The server has closed since the lookup, and its workers may have ended
+            _refuse_waiting(server)
         try:
-            server.questions.put(question, timeout=timeout)
-            if server.ended.is_set():
-                _refuse_waiting(server)
             return question.answer.result(max(0.0, deadline - time.monotonic()))
-        except (queue.Full, TimeoutError):
-            raise TransportError(f"No answer for {key} within {timeout:g} s.") from None
+        except TimeoutError:
+            raise _late(key, timeout) from None
 
     def publish(self, key: str, message: Message) -> None:
-        """See `Transport.publish`."""
+        """See `Transport.publish`; does nothing once closed."""
+        self._require_same_process()
+        if self._closed:
+            return
         with self._hub.lock:
             subscriptions = [
                 ring for expression, ring in self._hub.subscriptions if matches(expression, key)
@@ -172,8 +189,9 @@ class MemoryTransport(Transport):
     def close(self) -> None:
         """See `Transport.close`.
 
-        Waits for its threads: one that releases a device array while the interpreter shuts down
-        kills the process.
+        Waits for its threads: a thread that releases a device array while the interpreter shuts
+        down kills the process. In a fork it does nothing: the endpoint belongs to the process that
+        opened it.
         """
         if self._closed or self._hub.fork_generation != forks.generation():
             return
@@ -197,12 +215,14 @@ class MemoryTransport(Transport):
         join(self._threads, time.monotonic() + _GRACE)
 
     def _check_open(self) -> None:
-        """Raises a `TransportError` if the endpoint is closed, and a ForkError in a fork, which
-        lacks the threads of the hub's endpoints.
-        """
-        forks.require_same_process(self._hub.fork_generation, "connection")
+        """Raises a TransportError if the endpoint is closed, and a ForkError in a fork."""
+        self._require_same_process()
         if self._closed:
             raise TransportError("The transport is closed.")
+
+    def _require_same_process(self) -> None:
+        """Raises a ForkError in a fork, which lacks the threads of the hub's endpoints."""
+        forks.require_same_process(self._hub.fork_generation, "connection")
 
     def _start(self, name: str, target: Callable[..., None], *arguments: object) -> None:
         """Runs a function in a daemon thread."""
@@ -214,14 +234,19 @@ class MemoryTransport(Transport):
 _named: weakref.WeakValueDictionary[str, MemoryHub] = weakref.WeakValueDictionary()
 """Hubs with an endpoint, by name."""
 _listening = threading.Condition()
+"""Protects `_named`, and is notified once a hub has a listener."""
 
 
 def listen_in_memory(name: str) -> MemoryTransport:
-    """Creates the listening endpoint of a named hub; raises a CongraspError if there is one
-    already.
+    """Creates the listening endpoint of a named hub; raises a CongraspError if this process has
+    one already.
     """
     with _listening:
-        hub = _named.setdefault(name, MemoryHub())
+        hub = _named.get(name)
+        # In a fork, the listener of an inherited hub is in the process that opened it
+        if hub is None or hub.fork_generation != forks.generation():
+            hub = MemoryHub()
+            _named[name] = hub
         if hub.listening:
             raise CongraspError(f"memory/{name} is in use in this process.", "Choose another name.")
         hub.listening = True
@@ -247,43 +272,53 @@ def connect_in_memory(name: str, wait: float) -> MemoryTransport:
     )
 
 
+def _late(key: str, timeout: float) -> TransportError:
+    """Error of a query whose answer has not arrived within `timeout` seconds."""
+    return TransportError(f"No answer for {key} within {timeout:g} s.")
+
+
 def _refuse_waiting(server: _Server) -> None:
-    """Fails the queued queries of a closed server, and wakes its workers."""
+    """Fails the queued queries of a closed server, and ends its idle workers."""
     while True:
         try:
             question = server.questions.get_nowait()
         except queue.Empty:
             break
-        if question is not None:
-            question.answer.set_exception(
-                TransportError(f"No response for {question.key}: its server has closed.")
-            )
+        if question is None:
+            continue
+        server.places.release()
+        question.answer.set_exception(
+            TransportError(f"No response for {question.key}: its server has closed.")
+        )
     for _ in range(server.workers):
-        with contextlib.suppress(queue.Full):
-            server.questions.put_nowait(None)
+        server.questions.put(None)
 
 
 def _serve(server: _Server, handler: Answerer, admission: Admission) -> None:
     """Answers queries until the server closes; runs in a separate thread."""
     while not server.ended.is_set():
         question = server.questions.get()
-        if question is not None:
-            _answer(question, functools.partial(_ask, question, handler, admission))
+        if question is None:
+            return
+        server.places.release()
+        _settle(question, functools.partial(_reply, question, handler, admission))
 
 
-def _ask(
+def _reply(
     question: _Question, handler: Answerer, admission: Admission
 ) -> "Message | Future[Message]":
-    """Returns the handler's reply to an admitted query."""
+    """Returns the reply of the admission if it rejects the query, else that of the handler."""
     return admission(question.key) or handler(question.key, question.request)
 
 
-def _answer(question: _Question, outcome: "Callable[[], Message | Future[Message]]") -> None:
-    """Sets a query's result to the outcome of a function, or to its exception."""
+def _settle(question: _Question, compute: "Callable[[], Message | Future[Message]]") -> None:
+    """Sets a query's answer to the result of a function, or to its exception. If the result is a
+    future, the answer is set once that future is done.
+    """
     try:
-        result = outcome()
+        result = compute()
         if isinstance(result, Future):
-            result.add_done_callback(lambda done: _answer(question, done.result))
+            result.add_done_callback(lambda done: _settle(question, done.result))
         else:
             question.answer.set_result(result)
     except CongraspError as error:
@@ -305,12 +340,11 @@ def _watch(watcher: _Watcher, on_change: Callable[[str, bool], None]) -> None:
 
 
 class PairTransport(Transport):
-    """Serves, publishes and declares tokens on two transports of the caller; queries and subscribes
-    on the first.
+    """Two transports of the caller as one: queries and subscriptions use only the first, everything
+    else uses both.
     """
 
     def __init__(self, first: Transport, second: Transport):
-        """Combines two transports; `query` and `subscribe` use only the first."""
         self._first = first
         self._both = (first, second)
 

@@ -131,10 +131,23 @@ def test_a_spawned_process_works(listener, tmp_path):
 def test_a_memory_transport_is_refused_in_a_fork(tmp_path):
     body = """
 from congrasp.common.transport import urls
+from congrasp.common.wire.codec import Message
 server = urls.listen("memory/a", "server")
 client = urls.connect("memory/a", "client")
 in_fork(lambda: client.declare_alive("a/b"))
+in_fork(lambda: client.publish("a/b", Message()))
 in_fork(lambda: urls.connect("memory/a", "client").declare_alive("a/b"))
 """
-    for line in lines_of(tmp_path, body)[::2]:
+    lines = lines_of(tmp_path, body)
+    assert len(lines) == 6
+    for line in lines[::2]:
         assert line.startswith("ForkError: ")
+
+
+def test_a_fork_may_listen_at_an_inherited_name(tmp_path):
+    body = """
+from congrasp.common.transport import urls
+server = urls.listen("memory/a", "server")
+in_fork(lambda: urls.listen("memory/a", "server").declare_alive("a/b"))
+"""
+    assert lines_of(tmp_path, body) == ["works", "ended"]

@@ -326,6 +326,33 @@ def test_memory_copies_nothing():
     client.close()
 
 
+def test_closed_endpoint_publishes_nothing(pair):
+    publisher, subscriber = pair
+    subscription = subscriber.subscribe(KEYS.logs, depth=100)
+    key = KEYS.log("event", "learner", "0")
+
+    def arrived():
+        publisher.publish(key, Message(meta={"closed": False}))
+        return subscription.receive(0.05)
+
+    eventually(arrived)
+    publisher.close()
+    publisher.publish(key, Message(meta={"closed": True}))
+    while received := subscription.receive(0.3):
+        assert received[1].meta == {"closed": False}
+
+
+def test_closing_ends_more_workers_than_places():
+    hub = MemoryHub()
+    server = MemoryTransport(hub)
+    server.serve(KEYS.act, lambda key, message: message, workers=3, depth=1)
+    name = f"memory-{KEYS.act}"
+    workers = [thread for thread in threading.enumerate() if thread.name == name]
+    assert len(workers) == 3
+    server.close()
+    assert not any(thread.is_alive() for thread in workers)
+
+
 # --- Zenoh only ---
 
 
