@@ -45,7 +45,9 @@ def of_command(
                 return cli(functools.partial(_deferred(command), **values))
             if values:
                 cli = functools.partial(cli, default=command(**values))
-            return functools.partial(_run, command, **vars(cli(command)))
+            fields = vars(cli(command))
+            # `main` checks the values in the keywords of the call before it makes the call
+            return functools.partial(_run, command, **fields)
 
     return parse
 
@@ -79,13 +81,11 @@ def examples(command: Command) -> list[str]:
 
 @contextlib.contextmanager
 def _epilog(lines: Sequence[str], arguments: Sequence[str]) -> Iterator[None]:
-    """Prints examples after the help, which the parser prints before it exits without an error.
-
-    It exits so also after the script of a shell, which has no examples.
-    """
+    """Prints examples after the help, once the parser has printed the help and exits."""
     try:
         yield
     except SystemExit as end:
+        # The exit code is 0 after a completion script, too, which must have no examples
         is_help = "-h" in arguments or "--help" in arguments
         if not end.code and lines and is_help:
             print("Examples:")
@@ -95,7 +95,10 @@ def _epilog(lines: Sequence[str], arguments: Sequence[str]) -> Iterator[None]:
 
 
 def _deferred(command: Command) -> Callable[..., Callable[[], Any]]:
-    """Returns a function with its arguments bound, to be called once they are valid."""
+    """Returns a function of the command's parameters that returns the call instead of making it.
+
+    So `main` can check the arguments before it makes the call.
+    """
 
     def bind(*args: Any, **options: Any) -> Callable[[], Any]:
         return functools.partial(_run, command, *args, **options)
@@ -104,13 +107,14 @@ def _deferred(command: Command) -> Callable[..., Callable[[], Any]]:
     for name, hint in typing.get_type_hints(command, include_extras=True).items():
         hints[name] = _described(name, hint)
         if dataclasses.is_dataclass(hint):
+            # Its fields become options without the parameter's name as a prefix
             hints[name] = Annotated[hints[name], tyro.conf.arg(name="")]
     signature = inspect.signature(command)
     parameters = []
     for name, parameter in signature.parameters.items():
         parameters.append(parameter.replace(annotation=hints[name]))
-    # tyro reads the options from these
-    vars(bind)["__signature__"] = signature.replace(parameters=parameters)
+    # tyro reads the options from these attributes
+    bind.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     bind.__name__ = command.__name__
     bind.__annotations__ = {**hints, "return": Any}
     bind.__doc__ = _CONTINUED_PARAMETER.sub(" ", inspect.getdoc(command) or "")
@@ -133,19 +137,29 @@ def _described(name: str, hint: Any) -> Any:
     marks: list[Any] = []
     if typing.get_origin(hint) is Annotated:
         kind, *marks = typing.get_args(hint)
+        kind = _computed_type(marks) or kind
     if name == "seed" or name.endswith("_seed"):
         marks.append(_SEED)
-    for mark in marks:
-        # A type that is known only when a command line is parsed, such as the engines' names
-        factory = getattr(mark, "constructor_factory", None)
-        if factory is not None:
-            kind = factory()
     display = tyro.conf.arg(metavar=_metavar(kind), help_behavior_hint=_hint)
     return Annotated[(kind, *marks, display)]
 
 
+def _computed_type(marks: Sequence[Any]) -> Any:
+    """Type that a mark `tyro.conf.arg(constructor_factory=...)` computes, such as the engines'
+    names; None without such a mark. tyro computes it when it parses, which is after `_metavar`
+    needs it.
+    """
+    for mark in marks:
+        factory = getattr(mark, "constructor_factory", None)
+        if factory is not None:
+            return factory()
+    return None
+
+
 def _metavar(kind: Any) -> str | None:
-    """Display form of the values of a tuple of any length; None: tyro's form."""
+    """Display form of the values of a tuple of any length; None for other types, so that tyro
+    chooses the form.
+    """
     arguments = typing.get_args(kind)
     if typing.get_origin(kind) is tuple and arguments[-1] is Ellipsis:
         return f"{_value(arguments[0])} ..."
@@ -194,18 +208,30 @@ def _dataclass(
     if not dataclasses.is_dataclass(info.type):
         return None
     hints = typing.get_type_hints(info.type, include_extras=True)
-    defaults = info.default if dataclasses.is_dataclass(info.default) else info.type
     meanings = _meanings(info.type)
     options = []
     for field in dataclasses.fields(info.type):
         option = tyro.constructors.StructFieldSpec(
             name=field.name,
             type=_described(field.name, hints[field.name]),
-            default=getattr(defaults, field.name, tyro.MISSING),
+            default=_default(field, info.default),
             helptext=functools.partial(meanings.get, field.name),
         )
         options.append(option)
     return tyro.constructors.StructConstructorSpec(instantiate=info.type, fields=tuple(options))
+
+
+def _default(field: dataclasses.Field[Any], instance: Any) -> Any:
+    """Default of an option: the field's value in the default instance of its class if there is one,
+    else the field's default. `tyro.MISSING` for a required option.
+    """
+    if dataclasses.is_dataclass(instance):
+        return getattr(instance, field.name)
+    if field.default is not dataclasses.MISSING:
+        return field.default
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return tyro.MISSING
 
 
 @functools.cache
