@@ -68,7 +68,8 @@ class Policy(Closing, Protocol):
             `object_angular_velocity`, `contact_force`, `contact_position`, `contact_found` and
             `wrist_load`, by the names and shapes of `common.task.types.SceneState` without the
             batch axis. A policy with a camera takes no pose of the object but, from a newer image,
-            `cloud` (N, 3) in the world frame.
+            `cloud` (N, 3) in the world frame. With an affordance, pass `surface_avoid` (N,) of the
+            newer points, too: the labels of the request apply by the points' order.
 
         Raises:
           RefusedError: the request or the state is invalid. Its subclasses in `common.errors` are
