@@ -3,7 +3,7 @@
 import itertools
 
 from congrasp.services.evaluate.paper.figures import paper_row
-from congrasp.services.evaluate.scores import ERRORS, Row, RowDescription, summarise
+from congrasp.services.evaluate.scores import ERROR_COLUMNS, Row, RowDescription, summarise
 
 FORCES = {
     f"{name}_{of}": 1.0
@@ -20,8 +20,8 @@ def summarised(name, hand, sample, *, objects, held_2s=True, **facts):
 def _no_errors() -> dict[str, float]:
     """Zero for every error of every constraint."""
     errors: dict[str, float] = {}
-    for columns in ERRORS.values():
-        errors |= dict.fromkeys(columns.values(), 0.0)
+    for names in ERROR_COLUMNS.values():
+        errors |= dict.fromkeys(names, 0.0)
     return errors
 
 

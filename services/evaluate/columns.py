@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from congrasp.actors.stress import SURVIVAL_NAMES
-from congrasp.services.evaluate.scores import ERRORS, UNITS, Row
+from congrasp.services.evaluate.scores import ERROR_COLUMNS, UNITS, Row
 from congrasp.services.evaluate.text_table import NONE, Columns, Styled, Table, percent
 
 FORCES_TITLE = "Forces after the removal: mean, 95th percentile"
 _SMALL_UNITS = {"rad": ("°", 180 / np.pi), "m": ("mm", 1000.0), "": ("%", 100.0)}
-"""Units of errors in columns of one error each, with the factor from those of rows."""
+"""Unit of a column with one error, and the factor to it, by the unit of the error in rows."""
 
 
 def row_title(row: Row) -> str:
@@ -27,6 +27,7 @@ def paper_rate(row: Row) -> str:
 def format_measure(row: Row, name: str, factor: float = 1.0) -> str:
     """Formats the mean and the 95th percentile of a force or depth, such as "7.1, 19.3"."""
     measures = {**row.forces, **row.plausibility}
+    # The mean of a force is `NAME_mean` in a row, that of a depth is `NAME`
     mean = measures.get(f"{name}_mean", measures.get(name))
     percentile = measures.get(f"{name}_p95")
     if mean is None or percentile is None:
@@ -35,16 +36,16 @@ def format_measure(row: Row, name: str, factor: float = 1.0) -> str:
 
 
 def errors_text(errors: Mapping[str, float | None]) -> str:
-    """Formats errors by constraint, such as "0.137 rad 0.020 m"."""
+    """Formats errors by constraint, such as "0.137 rad 0.020 m"; a comma separates constraints."""
     texts = []
-    for names in ERRORS.values():
-        parts = []
-        for name in names.values():
+    for names in ERROR_COLUMNS.values():
+        errors_of_constraint = []
+        for name in names:
             error = errors.get(name)
             if error is not None:
-                parts.append(f"{error:.3f} {UNITS[name]}".strip())
-        if parts:
-            texts.append(" ".join(parts))
+                errors_of_constraint.append(f"{error:.3f} {UNITS[name]}".strip())
+        if errors_of_constraint:
+            texts.append(" ".join(errors_of_constraint))
     return ", ".join(texts)
 
 
@@ -53,8 +54,8 @@ def error_columns(rows: Sequence[Row]) -> Columns[Row]:
     paper's as notes.
     """
     columns = []
-    for constraint, names in ERRORS.items():
-        for name in names.values():
+    for constraint, names in ERROR_COLUMNS.items():
+        for name in names:
             if all(row.errors.get(name) is None for row in rows):
                 continue
             unit, factor = _SMALL_UNITS[UNITS[name]]
@@ -137,7 +138,7 @@ def _rate_cell(name: str) -> Callable[[Row], str]:
     return lambda row: percent(row.plausibility.get(name))
 
 
-RATES: Columns[Row] = (
+SCORES: Columns[Row] = (
     ("constraint", row_title),
     ("episodes", _episodes),
     ("objects", _objects),
@@ -147,14 +148,12 @@ RATES: Columns[Row] = (
     ("error", lambda row: errors_text(row.errors)),
     ("paper", _paper),
 )
-"""Rates and errors, with those of the paper. "Of all objects": success and held, counting uncovered
-objects as failures."""
-RATE = dict(RATES)
-"""Cells of `RATES` by their columns."""
-_PUSHES = dict(
-    zip(("lifted", "pushed by half the weight", "and by 1 N"), SURVIVAL_NAMES, strict=True),
-)
-"""Names of the rates of survival, by their columns."""
+"""Success, held and errors, with those of the paper. "Of all objects": success and held, counting
+uncovered objects as failures."""
+SCORE_CELLS = dict(SCORES)
+"""Functions from a row to its cell, by the columns of `SCORES`."""
+_SURVIVAL_HEADS = ("lifted", "pushed by half the weight", "and by 1 N")
+"""Columns of `SURVIVAL_NAMES`; they are neighbours, and the third head continues the second."""
 PLAUSIBILITY: Columns[Row] = (
     ("constraint", row_title),
     ("hand in hand, mm", lambda row: format_measure(row, "hand_hand_mm")),
@@ -163,7 +162,7 @@ PLAUSIBILITY: Columns[Row] = (
     ("wrist m/s", _peak("wrist_speed")),
     ("m/s²", _peak("wrist_acceleration")),
     ("clean", _rate_cell("clean")),
-    *((column, _rate_cell(name)) for column, name in _PUSHES.items()),
+    *zip(_SURVIVAL_HEADS, map(_rate_cell, SURVIVAL_NAMES), strict=True),
 )
 """Plausibility: deepest penetrations (mean, 95th percentile), also of the hand's meshes into the
 object if it has some; peak speed and acceleration of the wrist; rates. Each push is a series of six
@@ -185,31 +184,36 @@ FORCES: Columns[Row] = (
 def tables_of(
     rows: Sequence[Row], title: str, missing: Sequence[tuple[str, str, str]] = ()
 ) -> list[Table]:
-    """Returns rows as tables: rates and errors with those of the paper, plausibility, then forces.
+    """Returns rows as tables: scores with those of the paper, plausibility, then forces.
 
     Args:
-      rows: rows of one policy, or of several, which are then named and grouped by constraint.
+      rows: rows of one policy or of several. Rows with equal titles are brought together; with
+        several policies, columns name each row's hand and method.
       title: title of the first table.
-      missing: hands and methods without a row, and the reason.
+      missing: (hand, method, reason) of each policy without a row.
     """
-    order = {name: i for i, name in enumerate(dict.fromkeys(map(row_title, rows)))}
-    rows = sorted(rows, key=lambda row: order[row_title(row)])
-    policy: Columns[Row] = ()
+    titles = list(dict.fromkeys(map(row_title, rows)))
+    rows = sorted(rows, key=lambda row: titles.index(row_title(row)))
+    policy_columns: Columns[Row] = ()
     if missing or _several_policies(rows):
-        policy = (("hand", lambda row: row.hand), ("method", lambda row: row.method))
+        policy_columns = (("hand", lambda row: row.hand), ("method", lambda row: row.method))
     columns_by_title = {
-        title: RATES,
+        title: SCORES,
         "Plausibility of all episodes": (*PLAUSIBILITY, *posture_columns(rows)),
         FORCES_TITLE: FORCES,
     }
     tables = []
-    for name, (constraint, *others) in columns_by_title.items():
-        tables.append(Table.of(name, rows, (constraint, *policy, *others)))
-    absent = []
+    for table_title, (first_column, *other_columns) in columns_by_title.items():
+        columns = (first_column, *policy_columns, *other_columns)
+        tables.append(Table.of(table_title, rows, columns))
+    scores, *other_tables = tables
+    missing_rows = []
     for hand, method, reason in missing:
-        absent.append([reason, hand, method, *[""] * (len(RATES) - 1)])
-    rates = tables[0]
-    return [dataclasses.replace(rates, rows=[*rates.rows, *absent]), *tables[1:]]
+        # The reason is in the first column; the cells after those of the policy are empty
+        cells = [reason, hand, method]
+        cells += [""] * (len(scores.columns) - len(cells))
+        missing_rows.append(cells)
+    return [dataclasses.replace(scores, rows=[*scores.rows, *missing_rows]), *other_tables]
 
 
 def _several_policies(rows: Sequence[Row]) -> bool:

@@ -15,8 +15,8 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.inputs import read_json
 from congrasp.common.task.constraints import CONSTRAINTS
 from congrasp.services.appearance.palette import INK
-from congrasp.services.evaluate.columns import RATE, paper_rate, row_title
-from congrasp.services.evaluate.scores import ERRORS, Row
+from congrasp.services.evaluate.columns import SCORE_CELLS, paper_rate, row_title
+from congrasp.services.evaluate.scores import ERROR_COLUMNS, Row
 from congrasp.services.evaluate.text_table import Table, percent
 from congrasp.services.evaluate.variations import NOISE
 from congrasp.services.viz.plots import (
@@ -93,7 +93,7 @@ def comparison_table(rows: Sequence[Row]) -> Table:
     columns: list[tuple[str, Callable[[Row], str]]] = [
         ("constraint", lambda row: labels[rows.index(row)]),
         ("episodes", lambda row: str(row.episodes)),
-        ("success", RATE["success"]),
+        ("success", SCORE_CELLS["success"]),
         ("paper", paper_rate),
         ("held 2 s", lambda row: percent(row.held_2s)),
     ]
@@ -133,7 +133,8 @@ def draw_noise(rows: Sequence[Row], path: pathlib.Path, title: str) -> None:
         style(below, "", f"{kind}, {unit}", "mean error")
         _draw_rate(above, levels, rows_of_kind, "success", "success", COLOURS[0])
         _draw_rate(above, levels, rows_of_kind, "held_2s", "held for 2 s", COLOURS[2])
-        for name, colour in zip(ERRORS[constraint].values(), (COLOURS[3], COLOURS[1]), strict=True):
+        colours = (COLOURS[3], COLOURS[1])
+        for name, colour in zip(ERROR_COLUMNS[constraint], colours, strict=True):
             _, error_unit = _TITLES[name]
             scale, label = _PLOTTED_UNITS[error_unit]
             below.plot(

@@ -17,7 +17,7 @@ from congrasp.common.wire.codec import encode
 from congrasp.services.evaluate.columns import (
     FORCES,
     FORCES_TITLE,
-    RATE,
+    SCORE_CELLS,
     error_columns,
     paper_rate,
 )
@@ -244,12 +244,12 @@ def _verdict(row: Row) -> str:
 def _rates(rows: Sequence[Row], conditions: str) -> Table:
     """Rates and errors, with those of the paper."""
     columns = [
-        ("constraint", RATE["constraint"]),
-        ("episodes", RATE["episodes"]),
-        ("objects", RATE["objects"]),
-        ("success", lambda row: Styled(RATE["success"](row), _verdict(row))),
+        ("constraint", SCORE_CELLS["constraint"]),
+        ("episodes", SCORE_CELLS["episodes"]),
+        ("objects", SCORE_CELLS["objects"]),
+        ("success", lambda row: Styled(SCORE_CELLS["success"](row), _verdict(row))),
         ("paper", lambda row: Styled(paper_rate(row), "paper")),
-        ("held for 2 s", RATE["held 2 s"]),
+        ("held for 2 s", SCORE_CELLS["held 2 s"]),
         *error_columns(rows),
     ]
     return Table.of(conditions, rows, columns)

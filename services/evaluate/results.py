@@ -23,7 +23,7 @@ from congrasp.common.runtime.engines import engine_title
 from congrasp.common.runtime.resources import cores
 from congrasp.services.evaluate.columns import (
     PLAUSIBILITY,
-    RATE,
+    SCORE_CELLS,
     paper_rate,
     posture_columns,
     row_title,
@@ -79,12 +79,12 @@ def rates(results: Results) -> list[str]:
     columns: Columns[Row] = (
         ("constraint", row_title),
         ("episodes (independent)", lambda row: f"{row.episodes} ({row.independent:.0f})"),
-        ("objects", RATE["objects"]),
-        ("success (95 %)", RATE["success"]),
-        ("held 2 s (95 %)", RATE["held 2 s"]),
-        ("of all objects", RATE["of all objects"]),
-        ("error", RATE["error"]),
-        ("paper", RATE["paper"]),
+        ("objects", SCORE_CELLS["objects"]),
+        ("success (95 %)", SCORE_CELLS["success"]),
+        ("held 2 s (95 %)", SCORE_CELLS["held 2 s"]),
+        ("of all objects", SCORE_CELLS["of all objects"]),
+        ("error", SCORE_CELLS["error"]),
+        ("paper", SCORE_CELLS["paper"]),
     )
     return Table.of("", results.rows, columns).markdown()
 

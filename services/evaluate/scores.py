@@ -51,6 +51,10 @@ def _units_of_errors() -> dict[str, str]:
 
 ERRORS = {constraint.name: _columns_of_errors(constraint) for constraint in CONSTRAINTS}
 """Names of the errors of each constraint, in the metrics of episodes and in rows."""
+ERROR_COLUMNS: dict[str, tuple[str, ...]] = {
+    constraint: tuple(columns.values()) for constraint, columns in ERRORS.items()
+}
+"""Names of the errors of each constraint in rows."""
 UNITS = _units_of_errors()
 """Units of the errors, by their names in rows."""
 _FORCE_COLUMNS = (

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from congrasp.common.io.files import write_atomically
 from congrasp.common.io.inputs import read_file
-from congrasp.services.evaluate.columns import PLAUSIBILITY, RATE, RATES
+from congrasp.services.evaluate.columns import PLAUSIBILITY, SCORE_CELLS, SCORES
 from congrasp.services.evaluate.lineup import PolicyKey
 from congrasp.services.evaluate.pages import Picture, embed, template
 from congrasp.services.evaluate.paper.comparison import (
@@ -297,12 +297,12 @@ def _detail_tables(results: Sequence[PartResult]) -> list[Table]:
             if row.plausibility.get("hand_hand_mm") is not None:
                 with_plausibility.append((result, row))
     first, *others = PLAUSIBILITY
-    plausibility = (first, ("held 2 s", RATE["held 2 s"]), *others)
+    plausibility = (first, ("held 2 s", SCORE_CELLS["held 2 s"]), *others)
     return [
         Table.of(
             "Rows without a counterpart in the paper",
             rows_without_counterpart(results),
-            _with_policy(RATES[:-1]),
+            _with_policy(SCORES[:-1]),
         ),
         Table.of(
             "Held for two seconds, and plausibility", with_plausibility, _with_policy(plausibility)

@@ -12,7 +12,7 @@ from rich.console import Console
 from congrasp.common.episode.episode import Episode
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.task.constraints import blocks
-from congrasp.services.evaluate.columns import RATE, tables_of
+from congrasp.services.evaluate.columns import SCORE_CELLS, tables_of
 from congrasp.services.evaluate.episodes import MAX_PROBED_EPISODES, Sample, join_samples
 from congrasp.services.evaluate.intervals import clustered_interval, independent_episodes, wilson
 from congrasp.services.evaluate.object_groups import object_groups
@@ -139,7 +139,7 @@ def test_uncovered_objects_count_as_failures():
     assert row.success_all == pytest.approx(0.3)
     assert row.held_2s == pytest.approx(1 / 3)
     assert row.held_all == pytest.approx(0.2)
-    assert RATE["of all objects"](row) == "30.0 %, 20.0 %"
+    assert SCORE_CELLS["of all objects"](row) == "30.0 %, 20.0 %"
     # Of a group of three of the five there is no uncovered object.
     assert (
         summarised(
@@ -157,7 +157,7 @@ def test_an_episode_that_repeats_counts_once_and_clusters_widen_the_interval():
     assert row.episodes == 16
     assert row.distinct == 2
     assert row.independent == pytest.approx(1.0)
-    assert RATE["episodes"](row) == "16 (2 different)"
+    assert SCORE_CELLS["episodes"](row) == "16 (2 different)"
     spread = summarised(
         "pose", "human", _sample([1] * 8 + [0] * 8, [0] * 16), held_2s=True, objects=["a"]
     )
