@@ -50,7 +50,7 @@ def hollow(mesh: trimesh.Trimesh, material: Material) -> bool:
     It is thicker than objects of its material are, or a sheet.
     """
     thickness = mean_thickness(mesh)
-    if thickness > material.thickest:
+    if thickness > material.thickest_solid:
         return True
     return not encloses(mesh) and thickness < _MAX_SHEET_THICKNESS_M
 

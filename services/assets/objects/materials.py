@@ -10,19 +10,23 @@ from congrasp.common.errors import CongraspError
 _CALLISTER = "Callister and Rethwisch, Materials Science and Engineering, table B.1"
 _CRC = "CRC Handbook of Chemistry and Physics, Density of Various Solids"
 _WOOD = "USDA Forest Service, Wood Handbook, FPL-GTR-282, table 5-3"
+_OTHER_PARTS = ""
+"""Key of the material without a part in `--material`, which is for all parts not named there."""
 
 
 class Material(NamedTuple):
-    """A material of household objects. Wall and thickest are estimates for ordinary cups, bottles
+    """A material of household objects. The two thicknesses are estimates for ordinary cups, bottles
     and boxes.
     """
 
     density: float
     """kg/m^3."""
     wall: float
-    """Wall of a hollow object, m."""
-    thickest: float
-    """Mean thickness (see `mean_thickness`) above which an object is hollow, m."""
+    """Thickness of the wall of a hollow object, m."""
+    thickest_solid: float
+    """Largest mean thickness (`masses.mean_thickness`) of a solid object, m. A thicker object is
+    hollow.
+    """
     source: str
     """Source of the density."""
 
@@ -48,19 +52,20 @@ def materials_of(text: str, parts: Sequence[str]) -> tuple[Material, ...]:
     Args:
       text: a material such as "steel", or PART=NAME for parts, such as "head=steel,handle=wood"; a
         name alone is for the other parts.
-      parts: names of the object's parts, in the order of the result.
+      parts: names of the object's parts, in the order of the result; an empty name for an object
+        without labelled parts.
 
     Raises:
       CongraspError: unknown material or part, or a part without material.
     """
     entries = [_entry(entry) for entry in text.split(",")]
-    by_part = dict(entries)
-    if len(by_part) < len(entries):
+    material_by_part = dict(entries)
+    if len(material_by_part) < len(entries):
         raise CongraspError(
             f"--material assigns two materials to one part: '{text}'.",
             "Pass one material, or PART=NAME for each part.",
         )
-    unknown = sorted(by_part.keys() - {"", *parts})
+    unknown = sorted(material_by_part.keys() - {_OTHER_PARTS, *parts})
     if unknown:
         named_parts = [part for part in parts if part]
         remedy = "Pass one material without a part: the object has no labelled parts."
@@ -71,19 +76,27 @@ def materials_of(text: str, parts: Sequence[str]) -> tuple[Material, ...]:
         )
     materials = []
     for part in parts:
-        if part not in by_part and "" not in by_part:
+        material = material_by_part.get(part) or material_by_part.get(_OTHER_PARTS)
+        if material is None:
             raise CongraspError(
-                f"--material has no material for the part '{part}'.", f"Add {part}=NAME."
+                f"--material has no material for the part '{part}'.", _missing_remedy(part)
             )
-        materials.append(by_part.get(part) or by_part[""])
+        materials.append(material)
     return tuple(materials)
 
 
+def _missing_remedy(part: str) -> str:
+    """Remedy for a part without material."""
+    if part:
+        return f"Add {part}=NAME."
+    return "Add a material without a part: this part has no name."
+
+
 def _entry(text: str) -> tuple[str, Material]:
-    """Part (empty for the other parts) and material of one entry of `--material`."""
+    """Part (`_OTHER_PARTS` without one) and material of one entry of `--material`."""
     part, _, name = text.strip().rpartition("=")
     if not part:
-        name = text.strip()  # of '=wood' too, which names no part
+        name = text.strip()  # the whole entry, so that '=wood' is an unknown name
     if name not in MATERIALS:
         raise CongraspError(
             f"--material is '{name}'.", f"Choose from the materials {', '.join(MATERIALS)}."

@@ -13,7 +13,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.objects.procedural import generate
 from congrasp.services.assets.objects import options
 from congrasp.services.assets.objects.masses import guessed_mass, weigh
-from congrasp.services.assets.objects.materials import materials_of
+from congrasp.services.assets.objects.materials import MATERIALS, materials_of
 from congrasp.services.assets.objects.named import ObjectAt, objects_of
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.assets.objects.units import (
@@ -157,6 +157,15 @@ def test_a_hammer_has_a_steel_head_and_a_wooden_handle(hammer, quick_import):
     assert weighed.mass == 0.5
     assert weighed.origin == obj.origin
     np.testing.assert_allclose(weighed.inertia / 0.5, obj.inertia / obj.mass)
+
+
+def test_a_nameless_part_without_material_has_a_remedy():
+    parts = ("head", "")
+    steel, wood = materials_of("head=steel,wood", parts)
+    assert (steel, wood) == (MATERIALS["steel"], MATERIALS["wood"])
+    with pytest.raises(CongraspError) as error:
+        materials_of("head=steel", parts)
+    assert "=NAME" not in str(error.value)
 
 
 def test_an_unknown_material_is_guessed_by_surface_and_volume_without_a_least_mass():
