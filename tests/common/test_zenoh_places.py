@@ -81,6 +81,7 @@ def _serve_beside_a_crowd():
         assert client.query(KEYS.health, Message(), timeout=60.0).meta == {"ready": True}
 
 
+@pytest.mark.slow
 def test_a_client_of_another_address_is_served_when_full():
     """In a process without the open files of other tests, among which connections are looked for
     (`zenoh_places.end_connections`).
