@@ -391,9 +391,9 @@ class Experiment:
         keep: bool,
         progress: Callable[[int], None],
     ) -> Iterator[tuple[_PlannedRow, Result]]:
-        """Simulates rows of one task with one simulator; yields each row with its result.
+        """Simulates rows of one task; yields each row with its result.
 
-        On a device, neighbours run in common batches, unless episodes are kept.
+        On a device, neighbouring rows run in common batches, unless episodes are kept.
         """
         finished = 0
         if keep or not ENGINES[self.physics].on_device:

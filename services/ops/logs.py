@@ -101,7 +101,7 @@ class MonitoringOptions:
         """Context that serves a collector's metrics, if a port is set."""
         if not self.metrics_port:
             return contextlib.nullcontext()
-        from congrasp.services.ops.metrics import serve_metrics
+        from congrasp.services.ops.metrics_endpoint import serve_metrics
 
         return serve_metrics(self.metrics_port, self.metrics_host, collector)
 

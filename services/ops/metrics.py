@@ -1,21 +1,14 @@
-"""A Prometheus endpoint for each role."""
+"""Metrics of each role, collected for Prometheus (`metrics_endpoint` serves them)."""
 
 import collections
-import contextlib
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from prometheus_client import CollectorRegistry, Histogram, ProcessCollector
+from prometheus_client import Histogram
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
-from prometheus_client.exposition import choose_encoder
-from starlette.applications import Starlette
-from starlette.requests import Request
-from starlette.responses import Response
-from starlette.routing import Route
 
-from congrasp.common.errors import PORT_ERRORS, TransportError, os_errors_as
-from congrasp.services.ops.http_server import HttpServer, listening_socket
+from congrasp.common.errors import TransportError
 
 _TICKETS = ("granted", "redeemed", "returned", "expired")
 _GAUGES = {
@@ -31,47 +24,7 @@ _GAUGES = {
         "Requests rejected because their actors had made too many useless ones.",
     ),
 }
-MAX_CONNECTIONS = 64  # at a time, shared by addresses
 _LATENCY_BUCKETS_MS = (0.2, 0.5, 1, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1000)
-
-
-@contextlib.contextmanager
-def serve_metrics(port: int, host: str, *collectors: Any) -> Iterator[None]:
-    """Context that serves collectors at http://HOST:PORT/metrics, with this process's memory and
-    CPU time.
-
-    Raises:
-      CongraspError: the port cannot be used.
-    """
-    # Collectors need no `describe`: names are not checked for clashes
-    registry = CollectorRegistry()
-    ProcessCollector(registry=registry)
-    for collector in collectors:
-        registry.register(collector)
-    with os_errors_as(
-        f"The metrics cannot be served at {host}:{port}",
-        "Pass another --metrics-port.",
-        PORT_ERRORS,
-    ):
-        listener = listening_socket(host, port)
-    server = HttpServer(_application(registry), listener, MAX_CONNECTIONS)
-    try:
-        yield
-    finally:
-        server.close()
-
-
-def _application(registry: CollectorRegistry) -> Starlette:
-    """Returns the application that answers scrapes."""
-
-    def scrape(request: Request) -> Response:
-        """Returns the metrics, or those that the query names; runs in a thread."""
-        names = request.query_params.getlist("name[]")
-        scraped = registry.restricted_registry(names) if names else registry
-        encode, content_type = choose_encoder(request.headers.get("accept", ""))
-        return Response(encode(scraped), headers={"Content-Type": content_type})
-
-    return Starlette(routes=[Route("/{path:path}", scrape)])
 
 
 class LearnerMetrics:

@@ -17,7 +17,8 @@ import yaml
 
 from congrasp.common.transport.ports import free_port
 from congrasp.services.cli.main import load
-from congrasp.services.ops.metrics import ActorMetrics, LearnerMetrics, ServerMetrics, serve_metrics
+from congrasp.services.ops.metrics import ActorMetrics, LearnerMetrics, ServerMetrics
+from congrasp.services.ops.metrics_endpoint import serve_metrics
 from tests.conftest import ROOT
 from tests.services.ops.test_metrics import STATUS, scrape
 

@@ -21,13 +21,8 @@ from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.transport.ports import free_port
 from congrasp.services.cli.main import main
 from congrasp.services.ops.logs import log, log_error, logging_as
-from congrasp.services.ops.metrics import (
-    MAX_CONNECTIONS,
-    ActorMetrics,
-    LearnerMetrics,
-    ServerMetrics,
-    serve_metrics,
-)
+from congrasp.services.ops.metrics import ActorMetrics, LearnerMetrics, ServerMetrics
+from congrasp.services.ops.metrics_endpoint import MAX_CONNECTIONS, serve_metrics
 from tests.waits import eventually, together
 
 STATUS = {

@@ -26,7 +26,8 @@ from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message
 from congrasp.services.cli.query import Query
 from congrasp.services.client.policy_client import PolicyClient
-from congrasp.services.ops.metrics import ServerMetrics, serve_metrics
+from congrasp.services.ops.metrics import ServerMetrics
+from congrasp.services.ops.metrics_endpoint import serve_metrics
 from congrasp.services.serve.inference import Inference, PolicyFunction
 from congrasp.services.serve.load import Load, Target, measure
 from congrasp.services.serve.server import (
