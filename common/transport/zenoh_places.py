@@ -39,6 +39,10 @@ _SMALL_ACCOUNT = 0.125
 """Share of the places up to which an account loses none."""
 _DESCRIPTORS = "/dev/fd"
 """Folder of the open files of this process; Windows has none."""
+_NETWORK_FAMILIES = (socket.AF_INET, socket.AF_INET6)
+"""Families of the sockets whose ends are a host and a port; event loops and child processes use
+others.
+"""
 
 
 class Connection(NamedTuple):
@@ -148,6 +152,8 @@ def end_connections(connections: Sequence[Connection]) -> None:
     with contextlib.suppress(OSError):
         for name in os.listdir(_DESCRIPTORS):
             with contextlib.suppress(OSError), _duplicate(int(name)) as other:
+                if other.family not in _NETWORK_FAMILIES:
+                    continue
                 address, port = other.getpeername()[:2]
                 if (address.removeprefix("::ffff:"), port) in ends:
                     other.shutdown(socket.SHUT_RDWR)

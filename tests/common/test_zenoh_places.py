@@ -2,6 +2,7 @@
 
 import contextlib
 import multiprocessing
+import socket
 
 import pytest
 
@@ -81,13 +82,30 @@ def _serve_beside_a_crowd():
         assert client.query(KEYS.health, Message(), timeout=60.0).meta == {"ready": True}
 
 
-@pytest.mark.slow
 def test_a_client_of_another_address_is_served_when_full():
-    """In a process without the open files of other tests, among which connections are looked for
-    (`zenoh_places.end_connections`).
-    """
+    """In a process of its own, whose limits this test changes."""
     process = multiprocessing.get_context("spawn").Process(target=_serve_beside_a_crowd)
     process.start()
     process.join(240)
     process.kill()
     assert process.exitcode == 0
+
+
+def test_only_connections_of_the_network_are_ended():
+    """A process also holds sockets without an address, such as those of an event loop."""
+    with contextlib.ExitStack() as stack:
+        for end in socket.socketpair():
+            stack.enter_context(end)
+        listener = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+        client = stack.enter_context(socket.create_connection(listener.getsockname()))
+        accepted, _ = listener.accept()
+        stack.enter_context(accepted)
+        other = stack.enter_context(socket.create_connection(listener.getsockname()))
+        address, port = client.getsockname()
+        zenoh_places.end_connections([Connection(address, address, port)])
+        client.settimeout(10)
+        assert client.recv(1) == b""
+        other.sendall(b"1")
+        other_accepted, _ = listener.accept()
+        stack.enter_context(other_accepted)
+        assert other_accepted.recv(1) == b"1"
