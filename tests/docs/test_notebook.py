@@ -31,6 +31,8 @@ def test_notebook_runs_and_shows_pictures_and_a_motion(tmp_path, monkeypatch):
     for name in FILES:
         shutil.copy(EXAMPLES / name, tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(EXAMPLES.parent))
+    # Set by commands that other tests ran in this process; a notebook shows no pictures with it.
+    monkeypatch.delenv("MPLBACKEND", raising=False)
     notebook = read_notebook()
     resources = {"metadata": {"path": str(tmp_path)}}
     nbclient.NotebookClient(notebook, timeout=600, resources=resources).execute()
