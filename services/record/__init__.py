@@ -6,7 +6,8 @@ Kinds of messages (`common.wire.codec.Message`):
   names b in the group a.
 * event: meta `time`, `level` (debug, info, warning, error, fatal), `text`.
 * version: meta with the description of a policy version.
-* rollout: a rollout as sent to the learner.
+* rollout: a rollout in the form that the learner gets, of all environments or of the first
+  `RunConfig.log_rollout_worlds`.
 * episode: the message of an `Episode` (`common.episode.episode`): T control steps of one world.
 
 `recorder` receives them, `converter` makes entries of them within the `budget` of each publisher,

@@ -24,14 +24,15 @@ DAMAGE = (McapError, struct.error, ValueError, MemoryError, OverflowError)
 """Exceptions of the `mcap` package, and of this module, on damaged files."""
 FRAME = struct.Struct("<BQ")
 """Opcode and length of a record."""
-LIMIT = 512 << 20
-"""Limit of an inflated chunk, bytes."""
+_MAX_CHUNK_BYTES = 512 << 20
+"""Limit of an inflated chunk."""
 COMPRESSIONS = ("zstd", "lz4")
 """Names of the compressions."""
-_MESSAGE_HEAD = 22  # bytes of a message's fields before its data
-# Limit of all inflated chunks of a file: our recordings shrink to a tenth
-_INFLATED = 128 << 20
-_RATIO = 20
+_MESSAGE_HEAD_BYTES = 22  # of a message's record before its data
+_INFLATED_BYTES = 128 << 20
+"""Bytes to which the chunks of any file may inflate, in addition to `_MAX_RATIO` times its size."""
+_MAX_RATIO = 20
+"""See `_INFLATED_BYTES`; our recordings inflate to ten times their size."""
 
 
 class DamagedChunkError(ValueError):
@@ -40,17 +41,21 @@ class DamagedChunkError(ValueError):
 
 @dataclasses.dataclass
 class Budget:
-    """Bytes that the chunks of a file may still inflate to."""
+    """Bytes to which the chunks of a file may still inflate."""
 
     left: int
 
     @classmethod
     def of(cls, size: int) -> "Budget":
         """Budget of a file of `size` bytes."""
-        return cls(_INFLATED + _RATIO * size)
+        return cls(_INFLATED_BYTES + _MAX_RATIO * size)
 
     def take(self, count: int) -> None:
-        """Takes bytes; raises a CongraspError if there are not enough left."""
+        """Takes `count` bytes.
+
+        Raises:
+          CongraspError: there are fewer left.
+        """
         self.left -= count
         if self.left < 0:
             raise CongraspError(
@@ -69,7 +74,7 @@ def content_of(record: bytes, budget: Budget) -> bytes:
       The content, for `records_of`.
 
     Raises:
-      DamagedChunkError: it is damaged, or exceeds `LIMIT`.
+      DamagedChunkError: it is damaged, or exceeds `_MAX_CHUNK_BYTES`.
       CongraspError: the budget is spent.
     """
     try:
@@ -80,7 +85,7 @@ def content_of(record: bytes, budget: Budget) -> bytes:
         for opcode, start, end in _frames(content):
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 _parsed(opcode, content[start:end])
-            elif opcode == Opcode.MESSAGE and end - start < _MESSAGE_HEAD:
+            elif opcode == Opcode.MESSAGE and end - start < _MESSAGE_HEAD_BYTES:
                 raise DamagedChunkError("A message lacks its fields.")
     except DAMAGE as error:
         raise DamagedChunkError(str(error)) from None
@@ -97,9 +102,9 @@ def records_of(content: bytes) -> Iterator[McapRecord]:
 def _inflated(chunk: Chunk, budget: Budget) -> bytes:
     """Content of a chunk, whose size is checked before and while it inflates."""
     size = chunk.uncompressed_size
-    if size > LIMIT:
+    if size > _MAX_CHUNK_BYTES:
         raise DamagedChunkError("The chunk is too large.")
-    # One byte more shows a chunk that has more than its size, or than the budget.
+    # One byte more, so that a chunk that exceeds its size or the budget is noticed below.
     limit = min(size, budget.left) + 1
     if chunk.compression == "":
         content = bytes(chunk.data)
@@ -116,7 +121,7 @@ def _inflated(chunk: Chunk, budget: Budget) -> bytes:
 
 
 def _read_zstd(data: bytes, limit: int) -> bytes:
-    """At most `limit` inflated bytes."""
+    """Returns at most `limit` inflated bytes."""
     try:
         with zstandard.ZstdDecompressor().stream_reader(data) as stream:
             return stream.read(limit)
@@ -125,7 +130,7 @@ def _read_zstd(data: bytes, limit: int) -> bytes:
 
 
 def _read_lz4(data: bytes, limit: int) -> bytes:
-    """At most `limit` inflated bytes."""
+    """Returns at most `limit` inflated bytes."""
     try:
         return lz4.frame.LZ4FrameDecompressor().decompress(data, limit)
     except (RuntimeError, EOFError) as error:
@@ -153,7 +158,7 @@ def _frames(content: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def _parsed(opcode: int, record: bytes) -> McapRecord:
-    """A schema, channel or message."""
+    """Returns the schema, channel or message of a record, which has no opcode and length."""
     stream = ReadDataStream(io.BytesIO(record))
     if opcode == Opcode.SCHEMA:
         return Schema.read(stream)

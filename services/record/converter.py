@@ -1,8 +1,6 @@
 """Converts the messages that a run publishes under `log/**` to entries of a recording.
 
-Kinds of `congrasp/<run>/log/<kind>/<role>/<name>`: `metrics` (meta: time, update or version,
-values), `event` (time, level, text), `version` (any scalars), `rollout` (some worlds of an actor's
-rollout, opaque) and `episode` (see `services.record.episode_entries`).
+`services.record` describes the kinds of messages, and the topics of the entries.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -67,7 +65,12 @@ class Converter:
         }
 
     def __call__(self, key: str, message: Message, now: int) -> list[Entry]:
-        """Converts one message that arrived at `now` (ns since 1970) to entries.
+        """Converts one message to entries.
+
+        Args:
+          key: the key on which it was published.
+          message: the message.
+          now: time of its arrival, ns since 1970.
 
         Raises:
           CongraspError: it is not a valid log message, or exceeds its sender's budget.
@@ -77,17 +80,17 @@ class Converter:
             setback = self._now - now
             self._ends = {name: end - setback for name, end in self._ends.items()}
         self._now = now
-        words = ["", "", *key.split("/")]
-        kind, role, name = words[-3:]
+        padded = ["", "", *key.split("/")]  # a key of fewer than three words has no known kind
+        kind, role, name = padded[-3:]
         if kind not in self._kinds:
             raise CongraspError(f"{ascii(kind)[:60]} is not a kind of log message.")
         check_name("role", role)
-        check_name("role", name)
+        check_name("process", name)
         publisher = Publisher(role, name)
         self._budget.admit(publisher)
         convert = self._kinds[kind]
         try:
-            message = Message(message.arrays, finite(message.meta))
+            message = Message(message.arrays, finite(message.meta))  # JSON has no NaN
             entries = list(convert(role, name, message, now))
         except (LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
             raise CongraspError(

@@ -72,6 +72,7 @@ def scene_entries(
     for step in range(episode.steps):
         now = start + step * step_ns
         yield _protobuf(f"{topic}/tf", now, transforms(episode, actor, step, slot, now))
+        # Shown until they are replaced, also if the next step is a little late.
         forces = contacts(episode, actor, step, now, 2 * step_ns)
         yield _protobuf(f"{topic}/contacts", now, forces)
         yield channels.entry(f"{topic}/signals", now, _signals(episode, step))
@@ -99,7 +100,9 @@ def _protobuf(topic: str, time: int, message: Any, *, latched: bool = False) -> 
 
 
 def _signals(episode: Episode, step: int) -> dict[str, Any]:
-    """Numbers of one step: seconds, rewards, forces, joints, the object's height."""
+    """Numbers of one step: time (s), rewards, forces (N), joints (rad; the wrist's slides m), and
+    the object's height (m).
+    """
     recorded = episode.require_recorded()
     terms = {name: float(values[step]) for name, values in recorded.rewards.items()}
     links = episode.link_names.tolist()

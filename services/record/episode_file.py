@@ -19,6 +19,7 @@ def save_episode(path: pathlib.Path, actor: str, episode: Episode) -> None:
     """
     with os_errors_as(f"{path} could not be written"):
         check_spelling(path)
+        # The hidden file gets its name when it is complete.
         writer = LogWriter(path.parent, f".{path.stem}", run=episode.object)
         start = time.time_ns()
         raw = raw_entry(actor, episode.to_message(), start)

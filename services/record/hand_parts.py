@@ -37,15 +37,14 @@ class Part(NamedTuple):
 
 @functools.lru_cache(maxsize=16)
 def surface_parts(hand: Hand) -> tuple[tuple[Part, ...], ...]:
-    """Rigid parts of the surface of each link, one of each material, in the link's frame; each is
-    sent once.
+    """Rigid parts of the surface of each link, one of each material, in the link's frame.
 
     A human hand's skin deforms, but its points at every step would make a recording many times as
     large. A triangle of skin therefore belongs to every link with a noticeable weight on it, so
     that the parts of two links overlap at a bent joint.
     """
     skin = _skin(hand)
-    weights = skin.weights[skin.faces]
+    weights = skin.weights[skin.faces]  # (E, 3, L), of the corners of each triangle
     strongest = np.eye(len(hand.links), dtype=bool)[weights.sum(1).argmax(-1)]
     members = strongest | (weights.max(1) >= _OVERLAP)
     share = min(1.0, _MAX_FACES / len(skin.faces))
@@ -56,8 +55,8 @@ def surface_parts(hand: Hand) -> tuple[tuple[Part, ...], ...]:
         for number, name in enumerate(MATERIALS):
             faces = skin.faces[is_member & (material_of_face == number)]
             if len(faces):
-                points, light_faces = _light(skin.points[faces] - origin, share)
-                parts.append(Part(MATERIAL_COLOURS[name], points, light_faces))
+                points, few_faces = _simplified(skin.points[faces] - origin, share)
+                parts.append(Part(MATERIAL_COLOURS[name], points, few_faces))
         parts_of_links.append(tuple(parts))
     return tuple(parts_of_links)
 
@@ -96,15 +95,21 @@ def _sample(parts: tuple[Part, ...], area: float) -> tuple[np.ndarray, np.ndarra
 
 
 def _skin(hand: Hand) -> Skin:
-    """Surface of the hand; made of its capsules if custom meshes cannot be read."""
+    """Surface of the hand; that of its capsules if custom meshes cannot be read."""
     with contextlib.suppress(CongraspError):
         return skin_of(hand)
     return skin_on(skeleton_of(hand))
 
 
-def _light(corners: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points and faces of a share of triangles (E, 3, 3), on a grid and without duplicate
-    points.
+def _simplified(corners: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """Simplifies a mesh, and rounds its points to a grid.
+
+    Args:
+      corners: (E, 3, 3) m, corners of the triangles.
+      share: share of the triangles to keep, at most 1.
+
+    Returns:
+      Different points (V, 3), m, and faces (F, 3) with an area.
     """
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
     mesh = trimesh.Trimesh(corners.reshape(-1, 3), faces)
@@ -112,10 +117,10 @@ def _light(corners: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
         count = max(_MIN_FACES_OF_PART, int(share * len(mesh.faces)))
         mesh = mesh.simplify_quadric_decimation(face_count=count)
     points, index = np.unique(np.round(mesh.vertices / _GRID_M), axis=0, return_inverse=True)
-    light_faces = index.reshape(-1)[mesh.faces]
-    a, b, c = light_faces.T
+    rounded_faces = index.reshape(-1)[mesh.faces]
+    a, b, c = rounded_faces.T
     has_area = (a != b) & (b != c) & (c != a)
-    return points * _GRID_M, light_faces[has_area]
+    return points * _GRID_M, rounded_faces[has_area]
 
 
 def _mesh(part: Part) -> "trimesh.Trimesh":

@@ -16,15 +16,15 @@ from congrasp.common.transport.base import Closing
 from congrasp.services.record.live_gate import LOCAL_HOST, LiveGate
 from congrasp.services.record.writer import Channel, Entry
 
-_BACKLOG = 20000
-"""Entries queued for their time; the newest beyond this are dropped."""
+_MAX_QUEUED_ENTRIES = 20000
+"""Most entries queued for their time; newer ones are dropped."""
 MAX_QUEUED_BYTES = 256 << 20
-"""Bytes of the entries queued for their time."""
-_TOPICS = 4096
-"""Open channels; beyond this the one that was silent for longest is closed."""
-_LATCHED_BYTES = 64 << 20
-"""Bytes of latched messages kept for late subscribers."""
-_BURST_BYTES = 256 << 10
+"""Most bytes of the entries queued for their time."""
+_MAX_CHANNELS = 4096
+"""Most open channels; a further one closes the one that was silent for longest."""
+_MAX_LATCHED_BYTES = 64 << 20
+"""Most bytes of latched messages kept for late subscribers."""
+_MAX_BURST_BYTES = 256 << 10
 """Bytes that are sent before the gate must have read them (`LiveGate.wait_until_read`)."""
 _READ_TIMEOUT_S = 1.0
 """Longest wait for the gate; then the entry is dropped."""
@@ -52,15 +52,20 @@ class LiveServer(Closing):
 
         self._sdk = foxglove
         self._context = foxglove.Context()
-        self._topics: collections.OrderedDict[str, tuple[Channel, Any]] = collections.OrderedDict()
-        self._last: collections.OrderedDict[str, Entry] = collections.OrderedDict()
+        # By topic, our channel and the SDK's; the one that was silent for longest comes first.
+        self._channels: collections.OrderedDict[str, tuple[Channel, Any]]
+        self._channels = collections.OrderedDict()
+        # By topic; the oldest comes first.
+        self._last_latched: collections.OrderedDict[str, Entry] = collections.OrderedDict()
         self._latched_bytes = 0
-        self._burst_bytes = 0
+        self._burst_bytes = 0  # sent since the gate had read everything
         self.queued_bytes = 0
         """Bytes of the entries that wait for their time."""
         self._accounting = threading.Lock()  # guards `queued_bytes` and `left_out`
+        # A heap by time (ns) and number; the number is unique, because entries have no order.
         self._waiting: list[tuple[int, int, Entry]] = []
-        self._number = itertools.count()
+        self._entry_numbers = itertools.count()
+        # Entries, topics with a new subscriber, and None to end.
         self._incoming: queue.SimpleQueue[Entry | str | None] = queue.SimpleQueue()
         self.left_out: collections.Counter[str] = collections.Counter()
         """Number of entries dropped because the queue was full, by topic."""
@@ -92,7 +97,7 @@ class LiveServer(Closing):
         """Queues an entry until its time, or drops it if the queue is full."""
         with self._accounting:
             queued_bytes = self.queued_bytes + len(entry.data)
-            if queued_bytes > MAX_QUEUED_BYTES or self._incoming.qsize() > _BACKLOG:
+            if queued_bytes > MAX_QUEUED_BYTES or self._incoming.qsize() > _MAX_QUEUED_ENTRIES:
                 self.left_out[entry.channel.topic] += 1
                 return
             self.queued_bytes = queued_bytes
@@ -119,8 +124,8 @@ class LiveServer(Closing):
                 return
             if isinstance(item, Entry):
                 self._schedule(item)
-            elif item in self._last:
-                self._send(self._last[item])
+            elif item in self._last_latched:
+                self._send(self._last_latched[item])
 
     def _seconds_to_next(self) -> float | None:
         """Time until the next entry is to be sent, s; None if none is queued."""
@@ -131,14 +136,14 @@ class LiveServer(Closing):
 
     def _schedule(self, entry: Entry) -> None:
         """Queues an entry until its time, or drops it if too many are queued."""
-        if len(self._waiting) < _BACKLOG:
-            heapq.heappush(self._waiting, (entry.time, next(self._number), entry))
+        if len(self._waiting) < _MAX_QUEUED_ENTRIES:
+            heapq.heappush(self._waiting, (entry.time, next(self._entry_numbers), entry))
             return
         self._release(entry)
         self._count_left_out(entry.channel.topic)
 
     def _count_left_out(self, topic: str) -> None:
-        """Counts a dropped entry."""
+        """Counts a dropped entry of a topic."""
         with self._accounting:
             self.left_out[topic] += 1
 
@@ -150,39 +155,39 @@ class LiveServer(Closing):
     def _send(self, entry: Entry) -> None:
         """Sends an entry on its channel, or drops it if the gate is behind."""
         topic = entry.channel.topic
-        if self._burst_bytes > _BURST_BYTES:
+        if self._burst_bytes > _MAX_BURST_BYTES:
             if not self._gate.wait_until_read(_READ_TIMEOUT_S):
                 self._count_left_out(topic)
                 return
             self._burst_bytes = 0
         self._burst_bytes += len(entry.data)
-        channel, _ = self._topics.get(topic, (None, None))
+        channel, _ = self._channels.get(topic, (None, None))
         if channel != entry.channel:
-            self._advertise(entry.channel)
-        self._topics.move_to_end(topic)
+            self._open_channel(entry.channel)
+        self._channels.move_to_end(topic)
         if entry.channel.latched:
-            self._keep(entry)
-        _, opened = self._topics[topic]
+            self._keep_latched(entry)
+        _, opened = self._channels[topic]
         opened.log(entry.data, log_time=entry.time)
 
-    def _keep(self, entry: Entry) -> None:
+    def _keep_latched(self, entry: Entry) -> None:
         """Keeps the last message of a latched channel, within the limit of all topics."""
-        replaced = self._last.pop(entry.channel.topic, None)
+        replaced = self._last_latched.pop(entry.channel.topic, None)
         if replaced is not None:
             self._latched_bytes -= len(replaced.data)
-        self._last[entry.channel.topic] = entry
+        self._last_latched[entry.channel.topic] = entry
         self._latched_bytes += len(entry.data)
-        while self._latched_bytes > _LATCHED_BYTES and len(self._last) > 1:
-            _, oldest = self._last.popitem(last=False)
+        while self._latched_bytes > _MAX_LATCHED_BYTES and len(self._last_latched) > 1:
+            _, oldest = self._last_latched.popitem(last=False)
             self._latched_bytes -= len(oldest.data)
 
-    def _advertise(self, channel: Channel) -> None:
-        """Opens a channel; a topic whose schema has grown gets a new one."""
-        if channel.topic in self._topics:
-            _, outdated = self._topics.pop(channel.topic)
+    def _open_channel(self, channel: Channel) -> None:
+        """Opens a channel; one of the same topic, whose schema has grown, is closed."""
+        if channel.topic in self._channels:
+            _, outdated = self._channels.pop(channel.topic)
             outdated.close()
-        elif len(self._topics) >= _TOPICS:
-            _, (_, silent) = self._topics.popitem(last=False)
+        elif len(self._channels) >= _MAX_CHANNELS:
+            _, (_, silent) = self._channels.popitem(last=False)
             silent.close()
         schema = self._sdk.Schema(
             name=channel.schema_name, encoding=channel.schema_encoding, data=channel.schema
@@ -190,12 +195,12 @@ class LiveServer(Closing):
         opened = self._sdk.Channel(
             channel.topic, schema=schema, message_encoding=channel.encoding, context=self._context
         )
-        self._topics[channel.topic] = (channel, opened)
+        self._channels[channel.topic] = (channel, opened)
 
 
 def _inside_host() -> str:
-    """Address for the server of the SDK, behind the gate: on Linux one of the loopback interface
-    that other sites in a browser do not know.
+    """Address for the SDK's server, behind the gate: on Linux a random one of the loopback
+    interface, so that the pages of other sites in a browser cannot know it.
     """
     if not platforms.HAS_LOOPBACK_NETWORK:
         return LOCAL_HOST

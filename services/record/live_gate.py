@@ -1,5 +1,5 @@
-"""Gate of the live view: admits programs of this machine and the Foxglove app, and passes their
-connections on to the server of the SDK, which would answer any site that a browser shows.
+"""Gate of the live view: admits programs of this machine and the Foxglove app alone, and relays
+their connections to the SDK's server, which itself would answer any site in a browser.
 """
 
 import asyncio
@@ -19,39 +19,45 @@ LOCAL_HOST = "127.0.0.1"
 _LOOPBACK = (LOCAL_HOST, "localhost", "::1")
 _APP = "foxglove.dev"
 """Domain of the app in a browser."""
-_HEAD_BYTES = 16 << 10
-"""Limit of a request's head."""
-_HEAD_S = 10.0
+_MAX_HEAD_BYTES = 16 << 10
+"""Limit of the head of a request."""
+_HEAD_TIMEOUT_S = 10.0
 """Time in which the head must arrive."""
-_SOCKETS = 32
-"""Connections at a time, shared by addresses."""
+_MAX_VIEWERS = 32
+"""Most connections at a time, which the addresses share."""
 UNREAD_BYTES = 64 << 20
-"""Bytes that wait for all viewers together; beyond this the one with the most is dropped."""
+"""Most bytes that wait for all viewers together; beyond them the viewer with the most unread bytes
+is dropped."""
 _REPORT_INTERVAL_S = 60.0
 """Least time between two log lines on dropped viewers."""
 _CHUNK_BYTES = 1 << 16
 _POLL_S = 0.001
 """Time between two checks for unread bytes."""
-_REQUEST_S = 10.0
-"""Time in which the server of the SDK must read what a viewer sends."""
-_CLOSING_S = 1.0
+_REQUEST_TIMEOUT_S = 10.0
+"""Time in which the SDK's server must read what a viewer sends."""
+_CLOSING_TIMEOUT_S = 1.0
 
 
 class LiveGate:
-    """Passes connections on to the server of the SDK, which answers any site that a browser
-    shows.
+    """Relays the connections of admitted viewers to the SDK's server.
 
-    It always reads what that server sends, since the server's queue for a viewer is limited by
-    number but not by bytes. The bytes that viewers have not read wait here (`UNREAD_BYTES`).
+    It reads at once what that server sends, since the server's queue for a viewer is limited by
+    the number of messages but not by bytes. The bytes that viewers have not read wait here, up to
+    `UNREAD_BYTES`.
     """
 
     def __init__(self, outside: socket.socket, inside: tuple[str, int]):
-        """Accepts connections of a listening socket, for the server at an address."""
+        """Starts a thread that accepts connections.
+
+        Args:
+          outside: the listening socket for viewers; `close` closes it.
+          inside: address and port of the SDK's server.
+        """
         self._outside = outside
         self._inside = inside
-        self._places = Places(_SOCKETS)
+        self._places = Places(_MAX_VIEWERS)
         self._viewers: dict[asyncio.WriteTransport, TransportSocket] = {}
-        """Socket on which the server of the SDK sends, by connection of a viewer."""
+        """For each viewer's connection, the gate's socket to the SDK's server."""
         self._dropped = 0
         self._next_report_time = 0.0
         self._loop = asyncio.new_event_loop()
@@ -61,11 +67,11 @@ class LiveGate:
     def close(self) -> None:
         """Stops accepting, and ends all connections."""
         self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(_CLOSING_S)
+        self._thread.join(_CLOSING_TIMEOUT_S)
         self._outside.close()
 
     def wait_until_read(self, timeout: float) -> bool:
-        """Waits until the gate has read what the server of the SDK has sent.
+        """Waits until the gate has read what the SDK's server has sent.
 
         Args:
           timeout: longest wait, s.
@@ -82,23 +88,23 @@ class LiveGate:
         return True
 
     async def _read_all(self) -> None:
-        """Returns when no bytes of the server of the SDK wait for the gate."""
+        """Returns when no bytes of the SDK's server wait for the gate."""
         while self._has_unread():
             await asyncio.sleep(_POLL_S)
 
     def _has_unread(self) -> bool:
-        """True if bytes of the server of the SDK wait for the gate."""
+        """True if bytes of the SDK's server wait for the gate."""
         with selectors.DefaultSelector() as selector:
             for to_socket in self._viewers.values():
-                if to_socket.fileno() >= 0:
+                if to_socket.fileno() >= 0:  # not closed since
                     selector.register(to_socket, selectors.EVENT_READ)
             return bool(selector.select(0))
 
     def _run(self) -> None:
-        """Runs until it is closed."""
+        """Accepts and relays connections until `close` stops the loop."""
         loop = self._loop
         asyncio.set_event_loop(loop)
-        server = asyncio.start_server(self._admit, sock=self._outside, limit=_HEAD_BYTES)
+        server = asyncio.start_server(self._admit, sock=self._outside, limit=_MAX_HEAD_BYTES)
         loop.run_until_complete(server)
         loop.run_forever()
         tasks = asyncio.all_tasks(loop)
@@ -108,12 +114,12 @@ class LiveGate:
         loop.close()
 
     async def _admit(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Passes on a connection while there is room."""
+        """Serves a connection if there is a place for it."""
         address = writer.get_extra_info("peername")[0]
         place = self._places.take(address, writer.transport.abort)
         if place is None:
             with contextlib.closing(writer), contextlib.suppress(OSError):
-                _answer(writer, "503 Service Unavailable", f"{_SOCKETS} viewers are connected.")
+                _answer(writer, "503 Service Unavailable", f"{_MAX_VIEWERS} viewers are connected.")
             return
         try:
             await self._serve(reader, writer)
@@ -121,27 +127,33 @@ class LiveGate:
             self._places.leave(place)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Passes on the connection of an allowed client, and answers others with the reason."""
+        """Relays the connection of an allowed client; others get the reason as the answer."""
         with (
             contextlib.closing(writer),
             contextlib.suppress(
                 OSError, EOFError, ValueError, asyncio.LimitOverrunError, asyncio.CancelledError
             ),
         ):
-            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _HEAD_S)
-            fault = _fault(head.decode("latin-1"))
-            if fault:
-                _answer(writer, "403 Forbidden", fault)
-                await asyncio.wait_for(writer.drain(), _HEAD_S)
+            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _HEAD_TIMEOUT_S)
+            refusal = _refusal(head.decode("latin-1"))
+            if refusal:
+                _answer(writer, "403 Forbidden", refusal)
+                await asyncio.wait_for(writer.drain(), _HEAD_TIMEOUT_S)
                 return
-            to_reader, to_writer = await asyncio.open_connection(*self._inside)
-            with contextlib.closing(to_writer):
-                to_writer.write(head)
-                self._viewers[writer.transport] = to_writer.get_extra_info("socket")
-                try:
-                    await self._relay(reader, writer, to_reader, to_writer)
-                finally:
-                    del self._viewers[writer.transport]
+            await self._connect(head, reader, writer)
+
+    async def _connect(
+        self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
+        """Relays an admitted connection, whose `head` has been read, until it ends."""
+        to_reader, to_writer = await asyncio.open_connection(*self._inside)
+        with contextlib.closing(to_writer):
+            to_writer.write(head)
+            self._viewers[writer.transport] = to_writer.get_extra_info("socket")
+            try:
+                await self._relay(reader, writer, to_reader, to_writer)
+            finally:
+                del self._viewers[writer.transport]
 
     async def _relay(
         self,
@@ -176,7 +188,7 @@ class LiveGate:
                 return
 
     def _limit_unread(self) -> None:
-        """Drops viewers until the unread bytes of the others are within the limit."""
+        """Drops the slowest viewers until the unread bytes of the others are within the limit."""
         unread = {viewer: viewer.get_write_buffer_size() for viewer in self._viewers}
         while sum(unread.values()) > UNREAD_BYTES:
             slowest = max(unread, key=lambda viewer: unread[viewer])
@@ -198,7 +210,7 @@ class LiveGate:
 
 
 def _answer(writer: asyncio.StreamWriter, status: str, text: str) -> None:
-    """Sends an answer without a connection to the server behind."""
+    """Sends an answer of the gate itself."""
     body = f"{text}\n".encode()
     head = f"HTTP/1.1 {status}\r\nContent-Length: {len(body)}\r\nConnection: close\r\n\r\n"
     writer.write(head.encode() + body)
@@ -208,10 +220,10 @@ async def _copy_requests(reader: asyncio.StreamReader, writer: asyncio.StreamWri
     """Copies what a viewer sends until the connection ends."""
     while data := await reader.read(_CHUNK_BYTES):
         writer.write(data)
-        await asyncio.wait_for(writer.drain(), _REQUEST_S)
+        await asyncio.wait_for(writer.drain(), _REQUEST_TIMEOUT_S)
 
 
-def _fault(head: str) -> str:
+def _refusal(head: str) -> str:
     """Reason why a request is refused; empty if it comes from this machine or from the app.
 
     A site's name may resolve to this machine (DNS rebinding), so Host must name the loopback
@@ -233,7 +245,7 @@ def _fault(head: str) -> str:
 
 
 def _is_allowed(origin: str) -> bool:
-    """True for the app in a browser, pages of this machine, and programs that are no sites."""
+    """True for the app in a browser, pages of this machine, and programs that are not sites."""
     site = urllib.parse.urlsplit(origin)
     if site.scheme not in ("", "http", "https"):
         return True

@@ -50,7 +50,7 @@ _FOOTER = struct.Struct("<QQI")
 _CRC = struct.Struct("<I")
 _MAX_RECORD_BYTES = 512 << 20
 _SEARCH_BYTES = 1 << 20  # read at a time in search of a chunk
-_MAX_LOSS_S = 86400.0  # a chunk with a later end is damaged
+_MAX_LOSS_S = 86400.0  # a chunk that ends more than a day after the message before it is damaged
 _MAX_LISTED_PLACES = 5
 
 FileMessage = tuple[Schema | None, Channel, McapMessage]
@@ -69,38 +69,43 @@ class Dropped:
     """Bytes of an incomplete record at the end: the writer was killed, or is still writing."""
     is_finished: bool = True
     """False if the file lacks its end."""
-    last: int = 0
-    """Time of the last message, ns."""
-    cut_until: int = 0
-    """Time until which the incomplete chunk at the end has messages, ns; 0 if unknown."""
+    last_time_ns: int = 0
+    """Time of the latest message that was read; 0 if none was."""
+    cut_until_ns: int = 0
+    """Time of the last message in the incomplete chunk at the end; 0 if unknown."""
 
     @property
     def seconds(self) -> float:
-        """Seconds that are missing at the end at least, or may be."""
+        """Seconds that may be missing at the end: those of the incomplete chunk, but at least the
+        time between two flushes.
+        """
         lost = 0.0
-        if self.last:
-            lost = (self.cut_until - self.last) / 1e9
+        if self.last_time_ns:
+            lost = (self.cut_until_ns - self.last_time_ns) / 1e9
         if lost > _MAX_LOSS_S:
             lost = 0.0
         return max(FLUSH_SECONDS, lost)
 
     def __str__(self) -> str:
         """Describes the losses in one line; empty if the file is complete."""
-        parts = []
+        losses = []
         if self.places or self.messages:
-            parts.append(self._damage())
+            losses.append(self._damage())
         if not self.is_finished:
-            parts.append(f"not finished: {self.seconds:.1f} s or more may be missing at its end")
-        return ", and ".join(parts)
+            losses.append(f"not finished: {self.seconds:.1f} s or more may be missing at its end")
+        return ", and ".join(losses)
 
     def _damage(self) -> str:
-        """Places and messages that were lost by damage."""
-        more = ", …" if len(self.places) > _MAX_LISTED_PLACES else ""
-        where = ", ".join(map(str, self.places[:_MAX_LISTED_PLACES])) + more
-        at = f", at byte {where}" if where else ""
+        """Describes the damaged places and the messages lost there."""
+        offsets = [str(place) for place in self.places[:_MAX_LISTED_PLACES]]
+        if len(self.places) > _MAX_LISTED_PLACES:
+            offsets.append("…")
+        where = ""
+        if offsets:
+            where = f", at byte {', '.join(offsets)}"
         return (
-            f"damaged in {len(self.places)} place(s){at}; at least {self.messages} message(s) were "
-            f"dropped"
+            f"damaged in {len(self.places)} place(s){where}; at least {self.messages} message(s) "
+            f"were dropped"
         )
 
 
@@ -150,7 +155,7 @@ class _Channels:
         return self._schemas.get(channel.schema_id), channel, message
 
     def _add_summary(self) -> None:
-        """Adds what only the summary has, if that is intact."""
+        """Adds the schemas and channels that only the summary has, if it is intact."""
         self._is_summary_read = True
         summary = intact_summary(self._file)
         if summary is not None:
@@ -188,12 +193,16 @@ def read_messages(file: BinaryIO, dropped: Dropped) -> Iterator[FileMessage]:
                 following = _next_chunk(file, position + 1, size)
             if following is None and _is_cut(file, position, size):
                 dropped.cut = size - position
-                dropped.cut_until = _end_of_chunk(file, position)
+                dropped.cut_until_ns = _last_time_of_chunk_ns(file, position)
                 return
             dropped.places.append(position)
+            if following is None:
+                return
+            # Message indexes follow a chunk; after a search for the next chunk there are none.
             follows_lost_chunk = record.end is not None
-            position = size if following is None else following
+            position = following
             continue
+        # The message indexes after a lost chunk give the number of its messages.
         if record.opcode != Opcode.MESSAGE_INDEX:
             follows_lost_chunk = False
         elif follows_lost_chunk:
@@ -205,14 +214,14 @@ def read_messages(file: BinaryIO, dropped: Dropped) -> Iterator[FileMessage]:
 
 def _messages_of(record: _Intact, channels: _Channels, dropped: Dropped) -> Iterator[FileMessage]:
     """Yields the messages of a record and adds its schemas and channels to `channels`."""
-    for part in record.content:
-        if isinstance(part, Schema):
-            channels.add_schema(part)
-        elif isinstance(part, Channel):
-            channels.add_channel(part)
-        elif isinstance(part, McapMessage):
-            dropped.last = max(dropped.last, part.log_time)
-            message = channels.with_channel(part)
+    for item in record.content:
+        if isinstance(item, Schema):
+            channels.add_schema(item)
+        elif isinstance(item, Channel):
+            channels.add_channel(item)
+        elif isinstance(item, McapMessage):
+            dropped.last_time_ns = max(dropped.last_time_ns, item.log_time)
+            message = channels.with_channel(item)
             if message is None:
                 dropped.messages += 1
             else:
@@ -222,14 +231,24 @@ def _messages_of(record: _Intact, channels: _Channels, dropped: Dropped) -> Iter
 def messages_between(
     file: BinaryIO, summary: Summary, topics: Collection[str], begin: int, end: int
 ) -> Iterator[FileMessage]:
-    """Yields messages between two times (ns, inclusive) by the index of a finished file.
+    """Yields messages between two times by the index of a finished file.
+
+    Args:
+      file: the file.
+      summary: its summary, with the index.
+      topics: topics of the messages.
+      begin: first time, ns.
+      end: last time, ns, inclusive.
 
     Raises:
       DamagedChunkError: a chunk is damaged.
       CongraspError: the file inflates to much more than its size.
     """
     budget = Budget.of(file.seek(0, io.SEEK_END))
-    channels = {key: one for key, one in summary.channels.items() if one.topic in topics}
+    channels = {}
+    for channel_id, channel in summary.channels.items():
+        if channel.topic in topics:
+            channels[channel_id] = channel
     for index in summary.chunk_indexes:
         is_outside = index.message_start_time > end or index.message_end_time < begin
         if is_outside or index.chunk_length > _MAX_RECORD_BYTES:
@@ -240,8 +259,8 @@ def messages_between(
         for record in records_of(content_of(chunk[FRAME.size :], budget)):
             if not isinstance(record, McapMessage) or not begin <= record.log_time <= end:
                 continue
-            channel = channels.get(record.channel_id)
-            if channel is not None:
+            if record.channel_id in channels:
+                channel = channels[record.channel_id]
                 yield summary.schemas.get(channel.schema_id), channel, record
 
 
@@ -268,8 +287,9 @@ def intact_summary(file: BinaryIO) -> Summary | None:
 
 def _is_finished(file: BinaryIO, size: int) -> bool:
     """True if the file ends with the magic bytes, and they are not those at its start."""
-    end = _read(file, max(0, size - len(MCAP0_MAGIC)), size)
-    return end == MCAP0_MAGIC and size > 2 * len(MCAP0_MAGIC)
+    magic_bytes = len(MCAP0_MAGIC)
+    end = _read(file, max(0, size - magic_bytes), magic_bytes)
+    return end == MCAP0_MAGIC and size > 2 * magic_bytes
 
 
 def _record_at(file: BinaryIO, position: int, size: int, budget: Budget) -> _Intact | _Damaged:
@@ -280,7 +300,7 @@ def _record_at(file: BinaryIO, position: int, size: int, budget: Budget) -> _Int
     if len(head) < FRAME.size:
         return _Damaged(0, None)
     opcode, length = FRAME.unpack_from(head)
-    if _mark_of(head) and opcode != Opcode.CHUNK_INDEX:
+    if _mark_of(head):  # whatever the opcode is, which may be damaged
         return _compressed_chunk_at(file, position, size, budget)
     end = position + FRAME.size + length
     is_opcode = Opcode.HEADER <= opcode <= Opcode.DATA_END
@@ -306,7 +326,7 @@ def _record_between(file: BinaryIO, position: int, end: int, budget: Budget) -> 
     if opcode == Opcode.MESSAGE_INDEX and not _is_message_index(record):
         return _Damaged(opcode, None)
     enclosed_chunk = _next_chunk(file, position + 1, end)
-    if enclosed_chunk is not None:  # the record's length is too large
+    if enclosed_chunk is not None:  # the length in the record's frame is damaged
         end = enclosed_chunk
     return _Intact(opcode, [], end)
 
@@ -344,7 +364,7 @@ def _chunk_content(record: bytes, budget: Budget) -> bytes | None:
 
 
 def _is_message_index(record: bytes) -> bool:
-    """True if the size of the entries matches the record's length."""
+    """True if the size of the entries, after the channel's number, matches the record's length."""
     entries_bytes = int.from_bytes(record[FRAME.size + 2 : FRAME.size + 6], "little")
     return entries_bytes == len(record) - FRAME.size - _INDEX_HEAD_BYTES
 
@@ -363,7 +383,9 @@ def _parse(opcode: int, content: bytes) -> McapRecord | None:
 
 
 def _mark_of(head: bytes) -> bytes:
-    """Length and name of the compression in the head of a chunk; empty if there is none."""
+    """Length and name of the compression in the head of a chunk; empty if it has none of
+    `COMPRESSIONS`, or is not a chunk.
+    """
     for mark in _MARKS:
         if head.startswith(mark, _MARK_OFFSET):
             return mark
@@ -381,8 +403,8 @@ def _data_length(head: bytes, mark: bytes) -> int:
     return int.from_bytes(head[end - _DATA_LENGTH_BYTES : end], "little")
 
 
-def _end_of_chunk(file: BinaryIO, position: int) -> int:
-    """Time of the last message of a chunk, whose head suffices, ns; 0 for another record."""
+def _last_time_of_chunk_ns(file: BinaryIO, position: int) -> int:
+    """Time of the last message of a chunk, from its head; 0 for another record."""
     head = _read(file, position, FRAME.size + _CHUNK_TIMES.size)
     if len(head) < FRAME.size + _CHUNK_TIMES.size or head[0] != Opcode.CHUNK:
         return 0
@@ -403,7 +425,7 @@ def _next_chunk(file: BinaryIO, start: int, end: int) -> int | None:
                 continue
             if _is_chunk(_read(file, chunk_start, _CHUNK_HEAD_BYTES), match[0]):
                 return chunk_start
-        # The next block overlaps this one, in case a mark is cut.
+        # The next block overlaps this one, so that a mark across their border is seen.
         position += max(1, len(block) - _LONGEST_MARK + 1)
     return None
 

@@ -5,7 +5,7 @@ import pathlib
 import secrets
 import sys
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from congrasp.services.record.writer import Entry, flatten
 
@@ -42,14 +42,14 @@ class MetricWriters:
         values = {name: float(value) for name, value in flatten(message["values"]).items()}
         step = int(message.get("update", message.get("version", 0)))
         learner = entry.channel.topic.removeprefix(_TOPIC)
-        self._each(lambda writer: writer.write(learner, 1e-9 * entry.time, step, values))
+        self._for_each(lambda writer: writer.write(learner, 1e-9 * entry.time, step, values))
 
     def close(self) -> None:
         """Finishes every writer."""
-        self._each(lambda writer: writer.close())
+        self._for_each(lambda writer: writer.close())
 
-    def _each(self, action: Callable[[ScalarWriter], None]) -> None:
-        """Runs an action of every writer."""
+    def _for_each(self, action: Callable[[ScalarWriter], None]) -> None:
+        """Calls `action` with every writer; one that fails is removed, with a warning."""
         for name, writer in list(self._writers.items()):
             try:
                 action(writer)
@@ -79,7 +79,7 @@ class TensorBoard:
 
         file = self._files.get(learner)
         if file is None:
-            file = self._begin(learner)
+            file = self._open_events(learner)
             self._files[learner] = file
             # A resumed run repeats steps: TensorBoard purges those of an earlier file from here on.
             file.write_event(
@@ -91,12 +91,13 @@ class TensorBoard:
         file.write_event(Event(wall_time=seconds, step=step, summary=summary))
         file.flush()
 
-    def _begin(self, learner: str) -> Any:
-        """Opens the event file of a learner."""
+    def _open_events(self, learner: str) -> Any:
+        """Opens a new event file of a learner."""
         from tensorboardX.event_file_writer import EventsWriter
 
         folder = self._folder / f"learner-{learner}"
         folder.mkdir(parents=True, exist_ok=True)
+        # The writer's names only differ by the second, and it overwrites a file of the same name.
         return EventsWriter(str(folder / "events"), f".{secrets.token_hex(4)}")
 
     def close(self) -> None:
@@ -114,6 +115,7 @@ class WeightsAndBiases:
         """Starts the run of this name and configuration; its files are in `folder`."""
         import wandb
 
+        mode: Literal["offline", "online"] = "offline" if offline else "online"
         settings = wandb.Settings(
             console="off", silent=True, x_disable_stats=True, init_timeout=_W_AND_B_START_S
         )
@@ -123,7 +125,7 @@ class WeightsAndBiases:
             group=run,
             dir=str(folder),
             config=dict(config),
-            mode="offline" if offline else "online",
+            mode=mode,
             settings=settings,
         )
         self._run.define_metric("*", step_metric="update")

@@ -32,8 +32,14 @@ _CLOUD_FIELDS = (
 def new_entity(
     update: SceneUpdate, name: str, frame: str, now: int, *, lifetime: int = 0
 ) -> SceneEntity:
-    """Adds an entity that moves with its frame; without a lifetime it stays until it is replaced or
-    removed.
+    """Adds an entity that moves with its frame.
+
+    Args:
+      update: the message that gets the entity.
+      name: identifies the entity; one of the same name is replaced.
+      frame: name of the frame.
+      now: time of the message, ns.
+      lifetime: time after which it is removed, ns; 0 keeps it until it is replaced or removed.
     """
     entity = update.entities.add(id=name, frame_id=frame, frame_locked=True)
     entity.timestamp.FromNanoseconds(now)
@@ -58,7 +64,7 @@ def add_capsules(entity: SceneEntity, link: Link, colour: Rgba) -> None:
     """Adds a link's capsules, which fill gaps in its skin at bent joints."""
     for capsule, (start, end) in zip(link.capsules, capsule_ends(link), strict=True):
         length = float(np.linalg.norm(end - start))
-        if length > 0:
+        if length > 0:  # otherwise one ball is the capsule
             cylinder = entity.cylinders.add(bottom_scale=1.0, top_scale=1.0)
             set_vector(cylinder.pose.position, (start + end) / 2)
             turn = _turn_onto([0.0, 0.0, 1.0], (end - start) / length)
@@ -69,10 +75,10 @@ def add_capsules(entity: SceneEntity, link: Link, colour: Rgba) -> None:
         add_ball(entity, start, capsule.radius, colour)
 
 
-def add_ball(entity: SceneEntity, center: np.ndarray, radius: float, colour: Rgba) -> None:
-    """Adds a ball."""
+def add_ball(entity: SceneEntity, centre: np.ndarray, radius: float, colour: Rgba) -> None:
+    """Adds a ball at a centre (3,), m."""
     ball = entity.spheres.add()
-    set_vector(ball.pose.position, center)
+    set_vector(ball.pose.position, centre)
     ball.pose.orientation.w = 1.0
     set_vector(ball.size, [2 * radius] * 3)
     set_colour(ball.color, colour)
@@ -86,7 +92,7 @@ def add_arrow(
     width: float,
     colour: Rgba,
 ) -> None:
-    """Adds an arrow of some length and width (m) along a unit direction."""
+    """Adds an arrow from `start` (3,) along a unit direction (3,); lengths are in m."""
     arrow = entity.arrows.add(
         shaft_length=_SHAFT * length,
         shaft_diameter=width,
@@ -99,7 +105,9 @@ def add_arrow(
 
 
 def point_cloud(frame: str, points: np.ndarray, colours: np.ndarray, now: int) -> PointCloud:
-    """Points (N, 3) of a frame with colours (N, 3) from 0 to 1."""
+    """Returns points (N, 3), m, in the frame of a name, with colours (N, 3) from 0 to 1, at the
+    time `now` (ns).
+    """
     packed = np.zeros(len(points), [("position", "<f4", 3), ("colour", "u1", 4)])
     packed["position"] = points
     # Foxglove's packed colours are red, green, blue, alpha in memory, one byte field each.

@@ -77,7 +77,7 @@ def read_records(
     dropped = Dropped()
     with os_errors_as(f"{path} cannot be read"), open_file(path) as file:
         start = file.read(len(MCAP0_MAGIC))
-        if not MCAP0_MAGIC.startswith(start):
+        if not MCAP0_MAGIC.startswith(start):  # a file may also be cut within these bytes
             raise CongraspError(
                 f"{path} is not an MCAP file.", "Pass a file written by 'congrasp record'."
             )
@@ -182,6 +182,7 @@ def pick_episode(path: pathlib.Path, index: int, *, success: bool = False) -> Ep
     Raises:
       CongraspError: there is no such index; the message gives their number.
     """
+    # For a negative index, the last -index episodes, of which the first is the requested one.
     last: collections.deque[Episode] = collections.deque(maxlen=max(1, -index))
     count = 0
     for episode in read_episodes(path):

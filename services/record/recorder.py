@@ -5,6 +5,7 @@ Sinks take the recorder's entries: MCAP files, live viewers and, for the metrics
 TensorBoard and Weights & Biases.
 """
 
+import math
 import pathlib
 import sys
 import threading
@@ -45,7 +46,7 @@ class Recorder(Closing):
 
     Attributes:
       messages: log messages recorded.
-      damaged: messages that were invalid for their key, or over budget, and were dropped.
+      damaged: messages that were dropped because they were invalid for their key, or over budget.
       error: reason why recording stopped; empty while it continues.
     """
 
@@ -66,7 +67,7 @@ class Recorder(Closing):
         Args:
           transport: any endpoint of the run; the caller closes it.
           run: name of the run.
-          directory: folder for the files; None only serves the sinks.
+          directory: folder for the files; with None there are none, and only the sinks get entries.
           name: prefix of the files' names.
           sinks: additional receivers of every entry.
           depth: messages buffered if they arrive faster than they are written; beyond it the oldest
@@ -83,6 +84,7 @@ class Recorder(Closing):
         self._warn = warn
         self._convert = Converter()
         self._stop = threading.Event()
+        self._deadline = math.inf  # set by `close`; seconds of `time.monotonic`
         self._thread = threading.Thread(target=self._work, daemon=True, name="recorder")
         self.messages = 0
         self.damaged = 0
@@ -111,6 +113,7 @@ class Recorder(Closing):
         """Writes received messages, finishes the file and ends the thread, within `timeout`
         seconds.
         """
+        # Before `_stop`, after which the thread reads it.
         self._deadline = time.monotonic() + _CLOSING_SHARE * timeout
         self._stop.set()
         if self._thread.ident is not None:
@@ -123,15 +126,15 @@ class Recorder(Closing):
 
     def _work(self) -> None:
         """Receives, writes and flushes until it is stopped."""
-        flushed = time.monotonic()
+        last_flush = time.monotonic()
         while True:
             timeout = 0.0 if self._stop.is_set() else _POLL_S
             received = self._subscription.receive(timeout)
             if received is not None:
                 self._take(*received)
-            if time.monotonic() - flushed > FLUSH_SECONDS:
+            if time.monotonic() - last_flush > FLUSH_SECONDS:
                 self._on_disk(lambda writer: writer.flush())
-                flushed = time.monotonic()
+                last_flush = time.monotonic()
             if self._stop.is_set() and (received is None or time.monotonic() > self._deadline):
                 break
         self._on_disk(lambda writer: writer.close())
@@ -154,7 +157,7 @@ class Recorder(Closing):
         self._on_disk(lambda writer: writer.write(*entries))
 
     def _on_disk(self, action: Callable[[LogWriter], object]) -> None:
-        """Runs an action of the writer; if it fails, recording stops and the run continues."""
+        """Calls `action` with the writer; if it fails, recording stops and the run continues."""
         if self._writer is None or self.error:
             return
         try:

@@ -46,7 +46,7 @@ from congrasp.services.record.primitives import (
 SPACING_M = 0.8
 """Distance between the frames of two actors in the world frame."""
 LEAST_FORCE_N = 0.05
-"""Force from which a link is in contact."""
+"""Force above which a link is in contact."""
 _GHOST: Rgba = (*HEADING, 0.25)
 _OBJECT: Rgba = (*OBJECT, 1.0)
 _TABLE: Rgba = (*TABLE, 1.0)
@@ -218,7 +218,7 @@ def _add_constraints(
 
 
 def _add_beads(entity: SceneEntity, points: np.ndarray) -> None:
-    """Adds balls (n, 3) on a line."""
+    """Adds a line through points (n, 3), with a ball at each."""
     line = entity.lines.add(type=LinePrimitive.LINE_STRIP, thickness=_LINE_WIDTH_M)
     line.pose.orientation.w = 1.0
     set_colour(line.color, _WAYPOINT)

@@ -146,7 +146,7 @@ class JsonChannels:
         return Entry(self._channels[topic], time, data)
 
     def _within_limits(self, topic: str, content: dict[str, Any]) -> dict[str, Any]:
-        """Returns an object; without its new fields if the topic is at one of its limits."""
+        """Returns an object, without its new fields if the topic would exceed one of its limits."""
         fields = self._fields[topic]
         old_content = _in_fields(fields, content)
         if self._schema_changes[topic] >= _MAX_SCHEMA_CHANGES:
@@ -247,15 +247,18 @@ def _in_fields(fields: Mapping[str, Any], value: Mapping[str, Any]) -> dict[str,
 
 
 def _count(fields: Mapping[str, Any]) -> int:
-    """Number of fields at any depth."""
-    return sum(_count(item) if isinstance(item, Mapping) else 1 for item in fields.values())
+    """Number of fields at any depth; groups themselves are not counted."""
+    count = 0
+    for item in fields.values():
+        count += _count(item) if isinstance(item, Mapping) else 1
+    return count
 
 
 def _schema(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """JSON schema of an object with these fields."""
+    """JSON schema of an object with these fields, each a JSON type or the fields of a group."""
     properties = {}
-    for name, kind in fields.items():
-        properties[name] = _schema(kind) if isinstance(kind, dict) else {"type": kind}
+    for name, field in fields.items():
+        properties[name] = _schema(field) if isinstance(field, dict) else {"type": field}
     return {"type": "object", "properties": properties}
 
 
@@ -294,12 +297,13 @@ class LogWriter:
         self._name = name
         self._run = run
         self._max_bytes = max_bytes
-        self._max_ns = round(1e9 * max_seconds)
+        self._max_age_ns = round(1e9 * max_seconds)
         self._open_file = open_file
-        self._number = 0
+        self._file_number = 0
         self._file: IO[bytes] | None = None
         self._path = directory
         self.files: list[pathlib.Path] = []
+        """Files so far, the current one last."""
 
     def write(self, *entries: Entry) -> None:
         """Writes entries that belong together to one file.
@@ -310,10 +314,7 @@ class LogWriter:
         if not entries:
             return
         time = entries[0].time
-        # A clock that was set back must not keep a file open forever.
-        if self._file and (
-            self._file.tell() > self._max_bytes or abs(time - self._first) > self._max_ns
-        ):
+        if self._file and self._is_full(self._file, time):
             self.close()
         if self._file is None:
             self._begin(time)
@@ -324,6 +325,12 @@ class LogWriter:
             sequence = self._sequences.get(channel_id, 0) + 1
             self._sequences[channel_id] = sequence
             self._writer.add_message(channel_id, entry.time, entry.data, entry.time, sequence)
+
+    def _is_full(self, file: IO[bytes], time: int) -> bool:
+        """True if the current file is too large or too old for an entry of a time, ns."""
+        # The difference may be negative: a clock that was set back must not keep a file open.
+        age = abs(time - self._first_time_ns)
+        return file.tell() > self._max_bytes or age > self._max_age_ns
 
     def flush(self) -> None:
         """Flushes to the operating system; a killed writer loses only later entries.
@@ -359,19 +366,10 @@ class LogWriter:
                 file.close()
 
     def _begin(self, time: int) -> None:
-        """Opens a new file under an unused name."""
+        """Begins a new file whose first entry has a time, ns since 1970."""
         stamp = datetime.datetime.fromtimestamp(time / 1e9, datetime.UTC).strftime("%Y%m%dT%H%M%SZ")
-        while self._file is None:
-            self._path = self._directory / f"{self._name}-{stamp}-{self._number:03d}.mcap{PART}"
-            self._number += 1
-            with contextlib.suppress(FileExistsError):  # of another recorder
-                file = self._open_file(self._path)
-                if not self._path.with_suffix("").exists():
-                    self._file = file
-                else:  # finished by another recorder within this second
-                    file.close()
-                    self._path.unlink()
-        self._first = time
+        self._file = self._create_file(stamp)
+        self._first_time_ns = time
         self._writer = Writer(self._file, CHUNK, CompressionType.ZSTD, _INDEXES)
         self._channels: dict[Channel, int] = {}
         self._schemas: dict[tuple[str, bytes], int] = {}
@@ -380,6 +378,22 @@ class LogWriter:
         self._writer.start(profile="", library="congrasp")
         self._writer.add_metadata("congrasp", {"run": self._run, **CONVENTIONS})
         self._writer.flush()
+
+    def _create_file(self, stamp: str) -> IO[bytes]:
+        """Opens a new file under an unused name, `_path`."""
+        while True:
+            name = f"{self._name}-{stamp}-{self._file_number:03d}.mcap{PART}"
+            self._path = self._directory / name
+            self._file_number += 1
+            try:
+                file = self._open_file(self._path)
+            except FileExistsError:  # another recorder is writing it
+                continue
+            if not self._path.with_suffix("").exists():
+                return file
+            # Another recorder has finished a file of this name within the same second.
+            file.close()
+            self._path.unlink()
 
     def _register(self, channel: Channel) -> int:
         """Returns the file's id of a channel, writing its schema first if needed."""

@@ -250,6 +250,15 @@ def test_dropped_chunks_are_warned_of_by_default(
     assert "damaged in 1 place(s)" in caplog.messages[0]
 
 
+def test_a_chunk_is_read_whatever_its_opcode(tmp_path):
+    path, ((start, _), *_) = flushed_file(tmp_path)
+    data = bytearray(path.read_bytes())
+    for opcode in range(256):
+        data[start] = opcode
+        path.write_bytes(data)
+        assert updates(path) == list(range(15)), opcode
+
+
 @settings(max_examples=150, deadline=None)
 @given(place=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
 def test_a_flipped_bit_costs_at_most_one_chunk_with_a_note(tmp_path_factory, place, bit):
