@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from congrasp.common.episode.episode import Episode
 from congrasp.services.export.facts import facts
-from congrasp.services.export.frames import TO_Y_UP, bodies, identifiers
+from congrasp.services.export.frames import TO_Y_UP, Body, bodies, identifiers
 
-_CM = 100.0
+_CM = 100.0  # per metre
 _ORDER = "ZYX"
 _POSITION = ("Xposition", "Yposition", "Zposition")
 _ROTATION = tuple(f"{axis}rotation" for axis in _ORDER)
@@ -26,44 +26,10 @@ def write(path: pathlib.Path, motions: Sequence[Episode]) -> None:
     (motion,) = motions
     motion_bodies = bodies(motion)
     names = identifiers([_ROOT, *(body.name for body in motion_bodies)])[1:]
-    count = len(motion.time)
-    # A root turns the world y-up; everything below keeps z-up coordinates.
-    lines = [
-        "HIERARCHY",
-        f"ROOT {_ROOT}",
-        "{",
-        "  OFFSET 0 0 0",
-        f"  CHANNELS 3 {' '.join(_ROTATION)}",
-    ]
-    columns = [np.tile(_angles(TO_Y_UP), (count, 1))]
-
-    def add(index: int, indent: str) -> None:
-        """Adds a joint and those below it."""
-        body = motion_bodies[index]
-        moves = len(body.translation) > 1
-        channels = (*_POSITION, *_ROTATION) if moves else _ROTATION
-        # Programs differ in whether a joint's positions replace its offset or add to it: with no
-        # offset they agree.
-        offset = np.zeros(3) if moves else _CM * body.translation[0]
-        lines.extend([f"{indent}JOINT {names[index]}", f"{indent}{{"])
-        lines.append(f"{indent}  OFFSET {_row(offset)}")
-        lines.append(f"{indent}  CHANNELS {len(channels)} {' '.join(channels)}")
-        if moves:
-            columns.append(_CM * body.translation)
-        columns.append(_angles(body.rotation))
-        children = [child for child, other in enumerate(motion_bodies) if other.parent == index]
-        for child in children:
-            add(child, indent + "  ")
-        if not children:
-            lines.extend([f"{indent}  End Site", f"{indent}  {{"])
-            lines.extend([f"{indent}    OFFSET {_row(_CM * _end(motion, index))}", f"{indent}  }}"])
-        lines.append(f"{indent}}}")
-
-    for index, body in enumerate(motion_bodies):
-        if body.parent < 0:
-            add(index, "  ")
-    lines += ["}", "MOTION", f"Frames: {count}", f"Frame Time: {motion.control_dt:.9g}"]
-    lines += map(_row, np.concatenate(columns, 1))
+    hierarchy = _Hierarchy(motion, motion_bodies, names)
+    lines = ["HIERARCHY", *hierarchy.lines]
+    lines += ["MOTION", f"Frames: {len(motion.time)}", f"Frame Time: {motion.control_dt:.9g}"]
+    lines += map(_row, np.concatenate(hierarchy.columns, 1))
     path.write_text("\n".join([*lines, ""]), encoding="ascii")
     about = facts(
         motion,
@@ -75,18 +41,84 @@ def write(path: pathlib.Path, motions: Sequence[Episode]) -> None:
     path.with_name(f"{path.name}.json").write_text(json.dumps(about, indent=1), encoding="utf-8")
 
 
+class _Hierarchy:
+    """Joints of the file.
+
+    Attributes:
+      lines: the joints and their channels.
+      columns: values (T, n) of the channels, in their order.
+    """
+
+    def __init__(self, motion: Episode, motion_bodies: Sequence[Body], names: Sequence[str]):
+        """Adds a joint for each body of a motion, with these names, below the root.
+
+        The root turns the world y-up; everything below keeps z-up coordinates.
+        """
+        self._motion = motion
+        self._bodies = motion_bodies
+        self._names = names
+        self.lines = [
+            f"ROOT {_ROOT}",
+            "{",
+            "  OFFSET 0 0 0",
+            f"  CHANNELS 3 {' '.join(_ROTATION)}",
+        ]
+        self.columns = [np.tile(_angles(TO_Y_UP), (len(motion.time), 1))]
+        for index, body in enumerate(motion_bodies):
+            if body.parent < 0:
+                self._add(index, "  ")
+        self.lines.append("}")
+
+    def _add(self, index: int, indent: str) -> None:
+        """Adds the joint of a body, and those below it."""
+        body = self._bodies[index]
+        moves = len(body.translation) > 1
+        channels = _ROTATION
+        offset = _CM * body.translation[0]
+        if moves:
+            channels = (*_POSITION, *_ROTATION)
+            # Programs differ in whether a joint's positions replace its offset or add to it:
+            # without an offset they agree.
+            offset = np.zeros(3)
+            self.columns.append(_CM * body.translation)
+        self.columns.append(_angles(body.rotation))
+        self.lines += [
+            f"{indent}JOINT {self._names[index]}",
+            f"{indent}{{",
+            f"{indent}  OFFSET {_row(offset)}",
+            f"{indent}  CHANNELS {len(channels)} {' '.join(channels)}",
+        ]
+        children = [child for child, other in enumerate(self._bodies) if other.parent == index]
+        for child in children:
+            self._add(child, indent + "  ")
+        if not children:
+            self.lines += [
+                f"{indent}  End Site",
+                f"{indent}  {{",
+                f"{indent}    OFFSET {_row(_CM * _end(self._motion, index))}",
+                f"{indent}  }}",
+            ]
+        self.lines.append(f"{indent}}}")
+
+
 def _angles(rotation: Rotation) -> np.ndarray:
-    """(T, 3) degrees without jumps of a turn."""
+    """Angles (T, 3) of T rotations, or (3,) of one, in degrees, without jumps of a full turn."""
     angles = rotation.as_euler(_ORDER, degrees=True)
-    return np.unwrap(angles, period=360, axis=0) if angles.ndim > 1 else angles
+    if angles.ndim == 1:
+        return angles
+    return np.unwrap(angles, period=360, axis=0)
 
 
 def _row(values: np.ndarray) -> str:
-    """Numbers of a line."""
+    """Formats numbers (n,) as a line."""
     return " ".join(f"{value:.7f}" for value in values)
 
 
 def _end(motion: Episode, index: int) -> np.ndarray:
-    """Drawn end of a last link, in its frame, m: the far end of its last capsule."""
+    """End (3,) of a body without children, in its frame, m: the far end of a link's last capsule,
+    or a centimetre along z without capsules.
+    """
     capsules = np.flatnonzero(motion.capsule_link == index)
-    return motion.capsule_ends[capsules[-1], 1] if len(capsules) else np.array([0.0, 0.0, 0.01])
+    if len(capsules) == 0:
+        return np.array([0.0, 0.0, 0.01])
+    return motion.capsule_ends[capsules[-1], 1]

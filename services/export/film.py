@@ -21,14 +21,14 @@ from congrasp.services.viz.sheets import save_video
 
 SIZE = (320, 240)
 """Width and height of the video, pixels."""
-_DIRECTION = np.array([0.8, -1.0, 0.7])
+_CAMERA_DIRECTION = np.array([0.8, -1.0, 0.7])
 """Direction from the table's middle to the camera."""
-_STEP = 10
-"""Frames between those that the camera must contain."""
+_EXTENT_STEP = 10
+"""Every tenth frame of a motion, and its last, determine what the camera must contain."""
 _KEYFRAMES = ("-g", "2")
-"""Options of the encoder, for random access in training."""
-_SAMPLED = 64
-"""Pixels between those that the statistics count."""
+"""Options of the encoder: every second frame is a keyframe, for random access in training."""
+_PIXEL_STEP = 64
+"""Every 64th pixel of a frame is in the statistics."""
 
 
 class Film(NamedTuple):
@@ -41,7 +41,13 @@ class Film(NamedTuple):
 
 
 def film(path: pathlib.Path, motions: Sequence[Episode], frame_rate: int) -> Film:
-    """Writes the video of all motions in sequence, from a camera that shows all of them."""
+    """Writes the video of all motions in sequence, from a camera that shows all of them.
+
+    Args:
+      path: the file to write.
+      motions: the motions.
+      frame_rate: frames per second.
+    """
     camera = camera_for(motions)
     pixels: list[np.ndarray] = []
 
@@ -50,7 +56,7 @@ def film(path: pathlib.Path, motions: Sequence[Episode], frame_rate: int) -> Fil
         for motion in motions:
             samples = []
             for picture in pictures(motion, camera):
-                samples.append(picture.reshape(-1, 3)[::_SAMPLED] / 255)
+                samples.append(picture.reshape(-1, 3)[::_PIXEL_STEP] / 255)
                 yield picture
             pixels.append(np.concatenate(samples))
 
@@ -62,25 +68,25 @@ def camera_for(motions: Sequence[Episode]) -> Camera:
     """Returns a camera that shows hands and objects of all motions."""
     points = np.concatenate([_extent(motion) for motion in motions])
     corners = points[ConvexHull(points).vertices]
-    return fit(corners, _DIRECTION, SIZE[0] / SIZE[1])
+    return fit(corners, _CAMERA_DIRECTION, SIZE[0] / SIZE[1])
 
 
 def _extent(motion: Episode) -> np.ndarray:
     """(n, 3) points of the hand's skin and of the object at some frames of a motion."""
     points: list[np.ndarray] = []
     skin = skin_of_motion(motion)
-    for frame in {*range(0, len(motion.time), _STEP), len(motion.time) - 1}:
+    for frame in {*range(0, len(motion.time), _EXTENT_STEP), len(motion.time) - 1}:
         hand = _hand(motion, skin, frame)
         assert hand.vertices is not None
         points.append(hand.vertices)
-        thing = _object(motion, frame)
-        turn = Rotation.from_quat(thing.quaternion, scalar_first=True)
-        points.append(turn.apply(thing.vertices) + thing.position)
+        shape = _object(motion, frame)
+        turn = Rotation.from_quat(shape.quaternion, scalar_first=True)
+        points.append(turn.apply(shape.vertices) + shape.position)
     return np.concatenate(points)
 
 
 def pictures(motion: Episode, camera: Camera) -> Iterator[np.ndarray]:
-    """(height, width, 3) uint8 of every frame of a motion."""
+    """Yields the picture (height, width, 3) uint8 sRGB of every frame of a motion."""
     skin = skin_of_motion(motion)
 
     def picture(frame: int) -> np.ndarray:
@@ -97,7 +103,7 @@ def calibration(camera: Camera) -> dict[str, Any]:
     """
     width, height = SIZE
     right, up, forward = camera.axes()
-    focal = height / 2 / np.tan(np.radians(camera.field_of_view) / 2)
+    focal_length = height / 2 / np.tan(np.radians(camera.field_of_view) / 2)  # pixels
     axes_and_position = np.column_stack([right, -up, forward, camera.position])
     return {
         "model": (
@@ -107,8 +113,8 @@ def calibration(camera: Camera) -> dict[str, Any]:
         "width": width,
         "height": height,
         "intrinsics": [
-            [focal, 0.0, width / 2 - 0.5],
-            [0.0, focal, height / 2 - 0.5],
+            [focal_length, 0.0, width / 2 - 0.5],
+            [0.0, focal_length, height / 2 - 0.5],
             [0.0, 0.0, 1.0],
         ],
         "camera_to_world": [

@@ -35,7 +35,7 @@ def export_motions(
         (`Episode.normalised`).
       kind: one of `FORMATS`.
       path: the file or folder to write.
-      camera: also records videos, if the format has them.
+      camera: also writes videos; only `DATASETS` have them.
       force: replaces an existing file; a folder is never replaced.
 
     Raises:
@@ -55,8 +55,8 @@ def export_motions(
     options = {"camera": True} if camera else {}
     with os_errors_as(f"{path} cannot be written", "Pass another with --out."):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as workplace:
-            folder = pathlib.Path(workplace)
+        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as temporary:
+            folder = pathlib.Path(temporary)
             module.write(folder / path.name, motions, **options)
             _move_files(folder, path, force=force)
 

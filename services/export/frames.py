@@ -18,8 +18,9 @@ NOT_LINKS = (OBJECT, SKIN, "world")
 """Names that links of arms must not have."""
 TO_Y_UP = Rotation.from_matrix([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Rotation from a world frame with the z axis up to one with the y axis up: z to y, y to -z."""
-_STILL = 1e-6
-"""Distance in the parent's frame below which the origin of a link does not move there, m."""
+_STILL_M = 1e-6
+"""Distance from the middle of its positions in the parent's frame up to which the origin of a link
+counts as not moving."""
 
 
 class Body(NamedTuple):
@@ -63,7 +64,7 @@ def _nested(
     names: np.ndarray, parents: np.ndarray, position: np.ndarray, quaternion: np.ndarray
 ) -> list[Body]:
     """Links in their parents' frames, from poses (T, L, 3) and (T, L, 4) in the world."""
-    turns = []
+    turns = []  # by link, T rotations each
     for link_quaternion in quaternion.swapaxes(0, 1).astype(float):
         turns.append(Rotation.from_quat(link_quaternion, scalar_first=True))
     places = position.swapaxes(0, 1).astype(float)
@@ -82,7 +83,7 @@ def _nested(
 def _without_noise(translation: np.ndarray) -> np.ndarray:
     """Returns a translation (T, 3), or its middle (1, 3) if it does not move."""
     middle = (translation.min(0) + translation.max(0)) / 2
-    if np.abs(translation - middle).max() < _STILL:
+    if np.abs(translation - middle).max() < _STILL_M:
         return middle[None]
     return translation
 
@@ -113,7 +114,7 @@ class Capsule(NamedTuple):
 
 
 def capsules(motion: Episode, link: int) -> Iterator[Capsule]:
-    """The capsules of a link by its index."""
+    """Yields the capsules of the hand's link with an index."""
     for number in np.flatnonzero(motion.capsule_link == link):
         start, end = motion.capsule_ends[number].astype(float)
         length = float(np.linalg.norm(end - start))
@@ -138,15 +139,15 @@ def pose_matrices(position: np.ndarray, rotation: Rotation) -> np.ndarray:
 
 
 def identifiers(names: Sequence[str]) -> list[str]:
-    """The names as distinct identifiers, with underscores in place of other characters than letters
-    and digits.
+    """Returns the names as distinct ASCII identifiers: other characters than letters and digits
+    become underscores.
     """
-    plain: list[str] = []
+    unique: list[str] = []
     for name in names:
         word = re.sub(r"\W", "_", name, flags=re.ASCII)
         if not word or word[0].isdigit():
             word = f"_{word}"
-        while word in plain:
+        while word in unique:
             word += "_"
-        plain.append(word)
-    return plain
+        unique.append(word)
+    return unique

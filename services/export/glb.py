@@ -1,9 +1,9 @@
 """Binary glTF 2.0 with an animation.
 
-One node a link, nested as hand and arm are, with translation and rotation (glTF forbids matrices on
-animated nodes). The hand's are the joints of a skin, by which its surface follows them; the arm's
-have meshes. glTF is y-up: a root node turns the world, so that everything below it keeps congrasp's
-z-up coordinates.
+Each link is a node with translation and rotation (glTF forbids matrices on animated nodes), nested
+as in hand and arm. The hand's links are the joints of a skin, so that its surface follows them; the
+arm's links have meshes. glTF is y-up: a root node turns the world, so that everything below it
+keeps congrasp's z-up coordinates.
 """
 
 import pathlib
@@ -24,11 +24,11 @@ from congrasp.services.viz.kernels import GAMMA
 from congrasp.services.viz.triangles import smooth_corners
 
 _KINDS = {1: gltf.SCALAR, 2: gltf.VEC2, 3: gltf.VEC3, 4: gltf.VEC4, 16: gltf.MAT4}
-"""Kinds of accessors by the numbers of an item."""
+"""Kinds of accessors by the number of components of an item."""
 _FLOAT = "<f4"
 _INDEX = "<u4"
 _JOINT = "<u2"
-_NUMBERS = {_FLOAT: gltf.FLOAT, _INDEX: gltf.UNSIGNED_INT, _JOINT: gltf.UNSIGNED_SHORT}
+_COMPONENT_TYPES = {_FLOAT: gltf.FLOAT, _INDEX: gltf.UNSIGNED_INT, _JOINT: gltf.UNSIGNED_SHORT}
 """Types of components by NumPy's dtype."""
 
 
@@ -41,8 +41,9 @@ def write(path: pathlib.Path, motions: Sequence[Episode]) -> None:
     file.asset.generator = "congrasp"
     file.nodes.append(gltf.Node(name="world", rotation=TO_Y_UP.as_quat().tolist(), extras=about))
     skin = skin_of_motion(motion)
-    for name in (*skin.parts(), OBJECT):
+    for name in skin.parts():
         scene.add_material(name, COLOURS[name])
+    scene.object_material = scene.add_material(OBJECT, COLOURS[OBJECT])
     file.animations = [_add_bodies(scene, motion)]
     _add_skin(scene, skin)
     # A skinned mesh follows its joints alone, so that its node is at the root.
@@ -54,31 +55,44 @@ def write(path: pathlib.Path, motions: Sequence[Episode]) -> None:
 
 
 class _Scene:
-    """A file under construction; every method returns the index of what it adds."""
+    """A file under construction. Each `add` method returns the index of what it adds, in the list
+    of its kind.
+
+    Attributes:
+      file: nodes, meshes, materials and accessors.
+      data: values of all accessors.
+      object_material: index of the object's material.
+    """
 
     def __init__(self) -> None:
         self.file = gltf.GLTF2()
         self.data = bytearray()
+        self.object_material = 0
 
     def add_values(
         self, values: np.ndarray, target: int | None = None, *, bounds: bool = False
     ) -> int:
-        """Adds values (n,), (n, 2), (n, 3), (n, 4) or (n, 4, 4); integers (n,) are indices, (n, 4)
-        those of joints.
+        """Adds an accessor.
+
+        Args:
+          values: (n,), (n, 2), (n, 3), (n, 4) or (n, 4, 4); integers (n,) are indices of vertices,
+            integers (n, 4) those of joints.
+          target: use of the values on a GPU, as glTF names it.
+          bounds: also stores the smallest and the largest values.
         """
-        number = _FLOAT
+        dtype = _FLOAT
         if np.issubdtype(values.dtype, np.integer):
-            number = _INDEX if values.ndim == 1 else _JOINT
+            dtype = _INDEX if values.ndim == 1 else _JOINT
         if values.ndim == 3:
             values = values.swapaxes(1, 2).reshape(-1, 16)  # by columns
-        values = np.ascontiguousarray(values, number)
+        values = np.ascontiguousarray(values, dtype)
         width = 1 if values.ndim == 1 else values.shape[1]
         view = gltf.BufferView(
             buffer=0, byteOffset=len(self.data), byteLength=values.nbytes, target=target
         )
         accessor = gltf.Accessor(
             bufferView=len(self.file.bufferViews),
-            componentType=_NUMBERS[number],
+            componentType=_COMPONENT_TYPES[dtype],
             count=len(values),
             type=_KINDS[width],
         )
@@ -100,8 +114,8 @@ class _Scene:
     def add_material(
         self, name: str, colour: Sequence[float], roughness: float | None = None
     ) -> int:
-        """Adds a material of an sRGB colour, red, green, blue from 0 to 1; glTF takes linear
-        factors.
+        """Adds a material of an sRGB colour: red, green, blue from 0 to 1. glTF has linear
+        colours.
         """
         linear = (np.array(colour) ** GAMMA).tolist()
         surface = gltf.PbrMetallicRoughness(baseColorFactor=[*linear, 1.0], metallicFactor=0.0)
@@ -116,7 +130,7 @@ class _Scene:
         return len(self.file.meshes) - 1
 
     def attributes(self, **values: np.ndarray) -> gltf.Attributes:
-        """Attributes of vertices by their names in the standard."""
+        """Returns the attributes of vertices, by their names in the standard."""
         accessors = {}
         for name, array in values.items():
             has_bounds = name == "POSITION"
@@ -126,7 +140,13 @@ class _Scene:
     def primitive(
         self, attributes: gltf.Attributes, faces: np.ndarray, material: int
     ) -> gltf.Primitive:
-        """Triangles (F, 3) between vertices."""
+        """Returns triangles (F, 3) between the vertices with these attributes.
+
+        Args:
+          attributes: see `attributes`.
+          faces: indices of the vertices.
+          material: index of the material.
+        """
         indices = self.add_values(faces.ravel(), gltf.ELEMENT_ARRAY_BUFFER)
         return gltf.Primitive(attributes=attributes, indices=indices, material=material)
 
@@ -137,9 +157,11 @@ def _add_bodies(scene: _Scene, motion: Episode) -> gltf.Animation:
     meshes_of_link = arm_meshes(motion)
     time = scene.add_values(motion.time, bounds=True)
     for body in bodies(motion):
-        turns = body.quaternions(scalar_first=False)
+        quaternions = body.quaternions(scalar_first=False)
         node = gltf.Node(
-            name=body.name, translation=body.translation[0].tolist(), rotation=turns[0].tolist()
+            name=body.name,
+            translation=body.translation[0].tolist(),
+            rotation=quaternions[0].tolist(),
         )
         number = scene.add_node(node, body.parent + 1)
         if body.name == OBJECT:
@@ -147,7 +169,7 @@ def _add_bodies(scene: _Scene, motion: Episode) -> gltf.Animation:
         elif body.name in meshes_of_link:
             primitives = [_arm_part(scene, mesh) for mesh in meshes_of_link[body.name]]
             node.mesh = scene.add_mesh(body.name, primitives)
-        tracks = {"rotation": turns}
+        tracks = {"rotation": quaternions}
         if len(body.translation) > 1:
             tracks["translation"] = body.translation
         for name, values in tracks.items():
@@ -160,11 +182,10 @@ def _add_bodies(scene: _Scene, motion: Episode) -> gltf.Animation:
 
 
 def _object(scene: _Scene, motion: Episode) -> gltf.Primitive:
-    """The object's mesh with normals and the last material, which becomes white if the points have
-    colours.
+    """Returns the object's mesh with normals. If its points have colours, its material becomes
+    white, since glTF multiplies both.
     """
     vertices, faces, colours = object_mesh(motion)
-    material = len(scene.file.materials) - 1
     flat = unwrapped(vertices, faces)
     arrays = {
         "POSITION": vertices[flat.source],
@@ -175,9 +196,9 @@ def _object(scene: _Scene, motion: Episode) -> gltf.Primitive:
         arrays["COLOR_0"] = colours[flat.source] ** GAMMA  # linear
     attributes = scene.attributes(**arrays)
     if colours is not None:
-        surface = scene.file.materials[material].pbrMetallicRoughness
+        surface = scene.file.materials[scene.object_material].pbrMetallicRoughness
         surface.baseColorFactor = [1.0, 1.0, 1.0, 1.0]
-    return scene.primitive(attributes, flat.faces, material)
+    return scene.primitive(attributes, flat.faces, scene.object_material)
 
 
 def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -193,20 +214,22 @@ def _downwards(uv: np.ndarray) -> np.ndarray:
 
 
 def _arm_part(scene: _Scene, mesh: Mesh) -> gltf.Primitive:
-    """A mesh of an arm's link, with sharp edges and a separate material."""
-    corners = mesh.faces.ravel()
-    _, normals = smooth_corners(mesh.vertices, mesh.faces)
-    normals = normals.reshape(-1, 3)
-    keys = np.column_stack([corners, normals.round(3)])
+    """Returns a mesh of an arm's link, with sharp edges and a material of its colour."""
+    corners, corner_normals = smooth_corners(mesh.vertices, mesh.faces)  # without flat triangles
+    positions = corners.reshape(-1, 3)
+    normals = corner_normals.reshape(-1, 3)
+    # Corners at one position become one vertex if they have the same normal.
+    keys = np.column_stack([positions, normals.round(3)])
     _, first, faces = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     material = scene.add_material("arm", mesh.colour, roughness=0.5)
-    attributes = scene.attributes(POSITION=mesh.vertices[corners[first]], NORMAL=normals[first])
+    attributes = scene.attributes(POSITION=positions[first], NORMAL=normals[first])
     return scene.primitive(attributes, faces, material)
 
 
 def _add_skin(scene: _Scene, skin: Skin) -> None:
-    """Adds the hand's surface as a separate node, whose skin has the links' nodes (from 1 on) as
-    joints.
+    """Adds the hand's surface as a separate node, whose skin has the links' nodes as joints.
+
+    The materials of the skin's parts are the first ones of the file, in this order.
     """
     flat = unwrapped(skin.points, skin.faces)
     skin = skin._replace(
@@ -229,7 +252,7 @@ def _add_skin(scene: _Scene, skin: Skin) -> None:
         primitives.append(scene.primitive(attributes, faces, material))
     inverse = np.tile(np.eye(4), (len(skin.origins), 1, 1))
     inverse[:, :3, 3] = -skin.origins
-    joints = [1 + link for link in range(len(skin.origins))]
+    joints = [1 + link for link in range(len(skin.origins))]  # node 0 is the world
     scene.file.skins = [
         gltf.Skin(name=SKIN, joints=joints, inverseBindMatrices=scene.add_values(inverse))
     ]

@@ -28,6 +28,7 @@ VERSION = "v3.0"
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 _PLACE = {"chunk_index": 0, "file_index": 0}
+"""Numbers of the chunk and file of every table and video: there is one of each."""
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _COUNTERS = {
     "frame_index": "int64",
@@ -36,6 +37,8 @@ _COUNTERS = {
     "task_index": "int64",
 }
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+_RATE_TOLERANCE = 1e-6
+"""Relative deviation from an integer frame rate that is due to rounding."""
 _STATE = "observation.state"
 _OBJECT = "observation.environment_state"
 _ACTION = "action"
@@ -62,40 +65,45 @@ class _Dataset(NamedTuple):
 
 
 def write(path: pathlib.Path, motions: Sequence[Episode], *, camera: bool = False) -> None:
-    """Writes motions of one hand and one control step as a dataset folder, optionally with a
-    camera's video.
+    """Writes motions of one robot and one control step as a dataset.
+
+    Args:
+      path: the folder to write.
+      motions: the motions.
+      camera: also writes a camera's video.
 
     Raises:
-      CongraspError: the motions differ in robot or control step, or the control step is no whole
-        number of frames a second.
+      CongraspError: the motions differ in robot or control step, or one second is not a whole
+        number of control steps.
     """
     dataset = _dataset(motions)
-    episodes = [_columns(dataset, episode) for episode in range(len(motions))]
+    columns_of_episodes = [_columns(dataset, episode) for episode in range(len(motions))]
     columns = {}
-    for name in episodes[0]:
-        columns[name] = np.concatenate([episode[name] for episode in episodes])
+    for name in columns_of_episodes[0]:
+        columns[name] = np.concatenate([episode[name] for episode in columns_of_episodes])
     stats = {name: _statistics(values) for name, values in columns.items()}
     info = _info(dataset)
-    described = {"congrasp": _about(motions), "stats": stats, "info": info}
+    json_files = {"congrasp": _about(motions), "stats": stats, "info": info}
     video = None
     if camera:
         file = path / _VIDEO.format(video_key=_CAMERA, **_PLACE)
         video = film(file, motions, dataset.fps)
-        described["camera"] = video.calibration
+        json_files["camera"] = video.calibration
         stats[_CAMERA] = _statistics_of_pixels(np.concatenate(video.pixels), dataset.rows)
         info["video_path"] = _VIDEO
         info["features"][_CAMERA] = _video_feature(dataset.fps)
     rows = []
-    for episode, episode_columns in enumerate(episodes):
+    for episode, episode_columns in enumerate(columns_of_episodes):
         rows.append(_episode_row(dataset, episode, episode_columns, video))
     data = pa.table({name: _column(values) for name, values in columns.items()})
+    meta = path / "meta"
     _write_parquet(path / "data" / _FILE.format(**_PLACE), data)
-    _write_parquet(path / "meta" / "episodes" / _FILE.format(**_PLACE), pa.Table.from_pylist(rows))
-    _write_parquet(path / "meta" / "tasks.parquet", _tasks_table(dataset.tasks))
+    _write_parquet(meta / "episodes" / _FILE.format(**_PLACE), pa.Table.from_pylist(rows))
+    _write_parquet(meta / "tasks.parquet", _tasks_table(dataset.tasks))
     urdf = "robot.urdf" if motions[0].arm else "hand.urdf"
-    (path / "meta" / urdf).write_text(robot_urdf(motions[0]), encoding="utf-8")
-    for name, content in described.items():
-        (path / "meta" / f"{name}.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
+    (meta / urdf).write_text(robot_urdf(motions[0]), encoding="utf-8")
+    for name, content in json_files.items():
+        (meta / f"{name}.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
 
 
 def _dataset(motions: Sequence[Episode]) -> _Dataset:
@@ -104,11 +112,13 @@ def _dataset(motions: Sequence[Episode]) -> _Dataset:
     Raises:
       CongraspError: see `write`.
     """
+    fps = _frame_rate(motions[0])
+    _check_same_robot(motions)
     tasks = [_task(motion) for motion in motions]
     starts = [0]
     for motion in motions:
         starts.append(starts[-1] + len(motion.time))
-    return _Dataset(motions, _frame_rate(motions), list(dict.fromkeys(tasks)), starts)
+    return _Dataset(motions, fps, tasks=list(dict.fromkeys(tasks)), starts=starts)
 
 
 def _episode_row(
@@ -130,34 +140,38 @@ def _episode_row(
     for name, values in columns.items():
         row |= _prefixed(f"stats/{name}", _statistics(values))
     if video is not None:
-        span = {
+        section = {
             **_PLACE,
             "from_timestamp": start / dataset.fps,
             "to_timestamp": end / dataset.fps,
         }
-        row |= _prefixed(f"videos/{_CAMERA}", span)
+        row |= _prefixed(f"videos/{_CAMERA}", section)
         stats = _statistics_of_pixels(video.pixels[episode], end - start)
         row |= _prefixed(f"stats/{_CAMERA}", stats)
     row |= _prefixed("meta/episodes", _PLACE)
     return row
 
 
-def _frame_rate(motions: Sequence[Episode]) -> int:
-    """Frames per second of motions of one robot."""
-    dt = motions[0].control_dt
+def _frame_rate(motion: Episode) -> int:
+    """Frames per second of a motion; raises a CongraspError if it is not an integer."""
+    dt = motion.control_dt
     fps = round(1 / dt)
-    if abs(fps * dt - 1) > 1e-6:
+    if abs(fps * dt - 1) > _RATE_TOLERANCE:
         raise CongraspError(
             f"A control step of {dt} s does not give an integer number of frames per second.",
             "LeRobot stores integer frame rates alone: export another format.",
         )
+    return fps
+
+
+def _check_same_robot(motions: Sequence[Episode]) -> None:
+    """Raises a CongraspError if the motions differ in robot or control step."""
     robot = _robot(motions[0])
     if any(_robot(motion) != robot for motion in motions):
         raise CongraspError(
             "A dataset has one robot and one control step, but the motions differ.",
             "Export the motions of each robot and control step as a separate dataset.",
         )
-    return fps
 
 
 def _prefixed(prefix: str, entries: Mapping[str, Any]) -> dict[str, Any]:
@@ -188,7 +202,7 @@ def _about(motions: Sequence[Episode]) -> dict[str, Any]:
 
 
 def _base_pose(arm: MovedArm) -> list[float]:
-    """Position and quaternion of an arm's base."""
+    """Position (m) and quaternion of an arm's base in the world."""
     return [*arm.link_position[0, 0].tolist(), *arm.link_quaternion[0, 0].tolist()]
 
 
@@ -219,7 +233,7 @@ def _task(motion: Episode) -> str:
 
 
 def _robot(motion: Episode) -> tuple[Any, ...]:
-    """Identity of the hand, the control step, and the arm."""
+    """Hand, control step, arm and mount of the hand, which are the same in one dataset."""
     identity = (motion.hand, motion.control_dt)
     arm = motion.arm
     if arm is None:
@@ -231,7 +245,9 @@ def _columns(dataset: _Dataset, episode: int) -> dict[str, np.ndarray]:
     """Columns (T, ...) of an episode, by name."""
     motion = dataset.motions[episode]
     count = len(motion.time)
-    arm = motion.arm.joint_position if motion.arm else np.zeros((count, 0))
+    arm = np.zeros((count, 0))
+    if motion.arm:
+        arm = motion.arm.joint_position
     wrist = np.concatenate([motion.wrist_position, motion.wrist_quaternion], 1)
     next_row = np.minimum(np.arange(count) + 1, count - 1)
     state = np.concatenate([arm, motion.joint_position, wrist], 1)
@@ -250,7 +266,7 @@ def _columns(dataset: _Dataset, episode: int) -> dict[str, np.ndarray]:
 
 
 def _column(values: np.ndarray) -> pa.Array:
-    """Values (T,) or (T, n) as a column."""
+    """Values (T,) or (T, n) as a column of a table."""
     if values.ndim == 1:
         return pa.array(values)
     return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
@@ -282,7 +298,7 @@ def _tasks_table(tasks: Sequence[str]) -> pa.Table:
 
 
 def _statistics(values: np.ndarray) -> dict[str, list[Any]]:
-    """Statistics of a column (T, ...), in the names of the format."""
+    """Statistics of a column (T, ...), by their names in the format."""
     columns = values.reshape(len(values), -1).astype(float)
     statistics: dict[str, list[Any]] = {
         "min": columns.min(0).tolist(),
@@ -297,7 +313,12 @@ def _statistics(values: np.ndarray) -> dict[str, list[Any]]:
 
 
 def _statistics_of_pixels(pixels: np.ndarray, frames: int) -> dict[str, list[Any]]:
-    """Statistics of some pixels (n, 3) of a number of frames: those of each channel as (1, 1)."""
+    """Statistics of each channel of some pixels (n, 3), in the format's shape (3, 1, 1).
+
+    Args:
+      pixels: the pixels.
+      frames: number of the frames, which the format counts in place of pixels.
+    """
     statistics = _statistics(pixels)
     for name, values in statistics.items():
         statistics[name] = [[[value]] for value in values]
@@ -306,21 +327,21 @@ def _statistics_of_pixels(pixels: np.ndarray, frames: int) -> dict[str, list[Any
 
 
 def _write_parquet(path: pathlib.Path, table: pa.Table) -> None:
-    """Writes a table, and its folder."""
+    """Writes a table; its folder is created if needed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     pq.write_table(table, path, compression="snappy")
 
 
 def _info(dataset: _Dataset) -> dict[str, Any]:
-    """Description of the data set: features with their shapes and names, counts, paths of files."""
+    """Description of the dataset: features with their shapes and names, counts, paths of files."""
     motion = dataset.motions[0]
     episodes = len(dataset.motions)
-    robot = ["congrasp", motion.hand]
+    robot = f"congrasp_{motion.hand}"
     if motion.arm:
-        robot.insert(1, motion.arm.name)
+        robot = f"congrasp_{motion.arm.name}_{motion.hand}"
     return {
         "codebase_version": VERSION,
-        "robot_type": "_".join(robot),
+        "robot_type": robot,
         "total_episodes": episodes,
         "total_frames": dataset.rows,
         "total_tasks": len(dataset.tasks),
@@ -338,14 +359,15 @@ def _info(dataset: _Dataset) -> dict[str, Any]:
 def _features(motion: Episode) -> dict[str, Any]:
     """Types, shapes and names of the columns of a motion."""
     joints = robot_joints(motion)
-    count = len(motion.joint_names)
+    fingers = joints[-len(motion.joint_names) :]
+    arm = joints[: -len(fingers)]
     wrist = [f"wrist_{name}" for name in _POSE]
     names = {
         _STATE: [*joints, *wrist],
         _OBJECT: [f"object_{name}" for name in _POSE],
         _ACTION: [
-            *(f"{name}_next" for name in joints[:-count]),
-            *(f"{name}_target" for name in joints[-count:]),
+            *(f"{name}_next" for name in arm),
+            *(f"{name}_target" for name in fingers),
             *(f"{name}_next" for name in wrist),
         ],
     }

@@ -13,7 +13,7 @@ from congrasp.common.policy.network import CLOUD, POINT, TRUNK, gated, layer_cou
 from congrasp.common.policy.normalizer import LIMIT
 from congrasp.services.export.policy_description import describe
 
-# Old ones, which every runtime in use supports; the graph needs no newer ones
+# Old versions, which every runtime in use supports; the graph needs no newer ones.
 _OPSET = 17
 _IR_VERSION = 8
 
@@ -36,14 +36,14 @@ class _Graph:
         return output
 
     def dense(self, layers: Mapping[str, Any], layer: str, x: str, output: str) -> str:
-        """Adds a layer of the network."""
+        """Adds a dense layer of the network, applied to x (..., D)."""
         kernel = self.constant(f"{layer}.kernel", layers[layer]["kernel"])
         product = self.node("MatMul", [x, kernel], f"{output}.product")
         bias = self.constant(f"{layer}.bias", layers[layer]["bias"])
         return self.node("Add", [product, bias], output)
 
     def columns(self, x: str, start: int, end: int, output: str) -> str:
-        """Adds the columns `start` to `end` of x."""
+        """Adds the columns from `start` to `end`, exclusive, of x (batch, D)."""
         bounds = [
             self.constant(f"{output}.start", [start], np.int64),
             self.constant(f"{output}.end", [end], np.int64),
@@ -52,7 +52,7 @@ class _Graph:
         return self.node("Slice", [x, *bounds, axes], output)
 
     def stack(self, layers: Mapping[str, Any], kind: str, x: str) -> str:
-        """Adds the layers of the trunk, or of a cloud's points."""
+        """Adds the layers of one kind, those of the trunk or of a cloud's points, applied to x."""
         for depth in range(layer_count(layers, kind)):
             name = f"{kind}_{depth}"
             x = self.dense(layers, name, x, f"{name}.dense")

@@ -38,7 +38,7 @@ from congrasp.services.export.surfaces import COLOURS, arm_meshes
 from congrasp.services.export.urdf import robot_urdf
 
 _WORLD = "world"
-_OFTEN = ("/joint_states", "/tf")
+_FRAME_TOPICS = ("/joint_states", "/tf")
 """Topics with a message for each frame; the others have one, which late subscribers receive."""
 _NEVER = QosTime(0x7FFFFFFF, 0xFFFFFFFF)
 _LATCHED = Qos(
@@ -52,10 +52,10 @@ _LATCHED = Qos(
     liveliness_lease_duration=_NEVER,
     avoid_ros_namespace_conventions=False,
 )
-_TRIANGLES = 11  # a marker's type
+_TRIANGLE_LIST = 11  # a type of visualization_msgs/Marker
 _Content = Mapping[str, Any]
-"""Fields of a message; fields of messages in it are mappings, too, and absent ones are zero, false
-or empty.
+"""Fields of a message by name. A field that is itself a message is a mapping, too; an absent field
+is zero, false or empty.
 """
 
 
@@ -68,8 +68,9 @@ class _Topic(NamedTuple):
 
 
 def write(path: pathlib.Path, motions: Sequence[Episode]) -> None:
-    """Writes one motion as a bag, which is a folder; it begins at one second, since in TF zero
-    means any time.
+    """Writes one motion as a bag, which is a folder.
+
+    The bag begins at one second, because time zero means the newest transform in TF.
     """
     (motion,) = motions
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -83,10 +84,11 @@ def write(path: pathlib.Path, motions: Sequence[Episode]) -> None:
         )
         bag.set_custom_data("congrasp", json.dumps(about))
         for name, topic in _topics(motion, trajectory).items():
-            qos = [] if name in _OFTEN else [_LATCHED]
+            qos = [] if name in _FRAME_TOPICS else [_LATCHED]
             channel = bag.add_connection(
                 name, topic.kind, typestore=store, offered_qos_profiles=qos
             )
+            # A topic with a single message has it at the first time.
             for stamp, content in zip(trajectory.stamps, topic.messages, strict=False):
                 message = _message(store, topic.kind, content)
                 bag.write(channel, stamp, store.serialize_cdr(message, topic.kind))
@@ -95,7 +97,8 @@ def write(path: pathlib.Path, motions: Sequence[Episode]) -> None:
 def _topics(motion: Episode, trajectory: JointTrajectory) -> dict[str, _Topic]:
     """All topics by name, from the trajectory of arm and fingers."""
     transforms = _transforms(motion, trajectory.stamps)
-    palm = next(i for i, link in enumerate(transforms[0]) if link["header"]["frame_id"] == _WORLD)
+    # The hand's links come first, so that the first body in the world frame is the palm.
+    palm = next(i for i, body in enumerate(transforms[0]) if body["header"]["frame_id"] == _WORLD)
     wrist = transforms[0][palm]["child_frame_id"]
     joints = robot_joints(motion)
     points = []
@@ -133,7 +136,7 @@ def _topics(motion: Episode, trajectory: JointTrajectory) -> dict[str, _Topic]:
 
 
 def _message(store: Typestore, kind: str, content: _Content) -> Any:
-    """A message of a type."""
+    """Returns the message of a type, with defaults for absent fields."""
     fields = {}
     for name, (node, field_type) in store.fielddefs[kind][1]:
         fields[name] = _field(store, node, field_type, content.get(name))
@@ -141,12 +144,13 @@ def _message(store: Typestore, kind: str, content: _Content) -> Any:
 
 
 def _field(store: Typestore, node: Nodetype, field_type: Any, content: Any) -> Any:
-    """The value of a field, or of an item of a sequence.
+    """Returns the value of a field, or of an item of a sequence.
 
     Args:
       store: types of messages.
-      node: kind of field.
-      field_type: its type; for a sequence, that of its items and its length.
+      node: kind of field: a message, a basic type, or a sequence.
+      field_type: name of the message; name and maximum length of the basic type; or kind and type
+        of the sequence's items, and its maximum length.
       content: content of the field; None for zero, false or empty.
     """
     if node == Nodetype.NAME:
@@ -155,14 +159,15 @@ def _field(store: Typestore, node: Nodetype, field_type: Any, content: Any) -> A
         if content is not None:
             return content
         return "" if field_type[0] == "string" else 0
-    (item, item_type), _ = field_type
-    if item == Nodetype.BASE and item_type[0] != "string":
-        return np.array([] if content is None else content, item_type[0])
-    return [_field(store, item, item_type, element) for element in content or ()]
+    (item_node, item_type), _ = field_type
+    items = () if content is None else content
+    if item_node == Nodetype.BASE and item_type[0] != "string":
+        return np.array(items, item_type[0])
+    return [_field(store, item_node, item_type, item) for item in items]
 
 
 def _transforms(motion: Episode, stamps: Sequence[int]) -> list[list[dict[str, Any]]]:
-    """TF of all bodies at each of T times in ns."""
+    """Returns the transforms of all bodies at each of T times in ns."""
     motion_bodies = bodies(motion)
     names = [body.name for body in motion_bodies]
     parents = [names[body.parent] if body.parent >= 0 else _WORLD for body in motion_bodies]
@@ -183,7 +188,7 @@ def _transforms(motion: Episode, stamps: Sequence[int]) -> list[list[dict[str, A
 
 
 def _object_marker(motion: Episode) -> dict[str, Any]:
-    """The object, with the colours of its corners if they are known, as a marker."""
+    """Returns the object as a marker, with the colours of its corners if they are known."""
     corners = motion.object_vertices[motion.object_faces.ravel()]
     marker = _marker(OBJECT, motion.object, 0, corners, COLOURS[OBJECT])
     if motion.colours:
@@ -193,7 +198,7 @@ def _object_marker(motion: Episode) -> dict[str, Any]:
 
 
 def _arm_markers(motion: Episode, arm: str) -> list[dict[str, Any]]:
-    """The meshes of the links of an arm as markers; `arm` is its name."""
+    """Returns the meshes of an arm's links as markers; `arm` is its name."""
     markers = []
     for link, meshes in arm_meshes(motion).items():
         for number, mesh in enumerate(meshes):
@@ -205,12 +210,20 @@ def _arm_markers(motion: Episode, arm: str) -> list[dict[str, Any]]:
 def _marker(
     frame: str, namespace: str, number: int, corners: np.ndarray, colour: Sequence[float]
 ) -> dict[str, Any]:
-    """Triangles of one colour, with corners (3 E, 3) in a frame, as a marker."""
+    """Returns a marker of triangles.
+
+    Args:
+      frame: name of its frame.
+      namespace: with `number`, its id.
+      number: see `namespace`.
+      corners: (3 E, 3) m, three for each triangle.
+      colour: red, green and blue, from 0 to 1.
+    """
     return {
         "header": _header(0, frame),
         "ns": namespace,
         "id": number,
-        "type": _TRIANGLES,
+        "type": _TRIANGLE_LIST,
         "pose": {"orientation": {"w": 1.0}},
         "scale": _named("xyz", np.ones(3)),
         "color": _colour(colour),

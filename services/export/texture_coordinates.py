@@ -11,10 +11,10 @@ from scipy.sparse.csgraph import connected_components
 
 _MARGIN = 0.004
 """Space between charts, as a share of the root of the surface's area."""
-_SMALLEST_SIZE = 1e-12
-"""Size of a surface that is not a point, m."""
+_MIN_SIZE_M = 1e-12
+"""Least side of the square, by which a surface that is a point is divided."""
 _ACROSS = np.array([(1, 2), (2, 0), (0, 1)])
-"""Axes of the projection along x, y and z."""
+"""Axes of the plane onto which faces are projected along x, y and z."""
 
 
 class Unwrapped(NamedTuple):
@@ -57,7 +57,7 @@ def unwrapped(vertices: np.ndarray, faces: np.ndarray) -> Unwrapped:
     np.maximum.at(high, chart_of_point, flat)
     area = np.linalg.norm(normals, axis=1).sum() / 2
     places, size = _packed(high - low, _MARGIN * float(np.sqrt(area)))
-    uv = (flat - low[chart_of_point] + places[chart_of_point]) / max(size, _SMALLEST_SIZE)
+    uv = (flat - low[chart_of_point] + places[chart_of_point]) / max(size, _MIN_SIZE_M)
     return Unwrapped(source, inverse.reshape(faces.shape), uv)
 
 

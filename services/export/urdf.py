@@ -19,7 +19,7 @@ _INERTIA = "1e-6"
 """Placeholder for every link, like the mass."""
 _EFFORT = "10"
 """Placeholder for every joint, like the mass."""
-_SPEED = 20.0
+_SPEED_RAD_S = 20.0
 """Speed limit of the hand's joints, rad/s."""
 
 
@@ -40,12 +40,12 @@ class _Joint(NamedTuple):
 
 
 def robot_urdf(motion: Episode) -> str:
-    """The hand as URDF, whose palm is the root; with an arm the whole robot, whose root is the
-    arm's base.
+    """Returns the hand as URDF, whose root is the palm; with an arm the whole robot, whose root is
+    the arm's base.
 
     Links and joints keep their names and frames. URDF has one joint between two links, so that a
-    link with several joints gets intermediate links of its name and a number. Efforts are not those
-    of the robot.
+    link with several joints gets intermediate links of its name and a number. Masses and efforts
+    are placeholders.
     """
     arm = motion.arm
     name = f"{arm.name}_{motion.hand}" if arm else motion.hand
@@ -74,7 +74,7 @@ def _add_hand(robot: ET.Element, motion: Episode) -> None:
                 axis=motion.joint_axis[j],
                 anchor=motion.joint_anchor[j] - origins[i],
                 limits=motion.joint_limits[j],
-                speed=_SPEED,
+                speed=_SPEED_RAD_S,
             )
             joints.append(joint)
         if parent >= 0:
@@ -102,7 +102,7 @@ def _add_arm(robot: ET.Element, arm: MovedArm) -> None:
 
 
 def _joint_of_arm(arm: MovedArm, j: int) -> _Joint:
-    """The arm's joint of an index."""
+    """Returns the arm's joint of an index."""
     kind = "revolute"
     if arm.joint_slides[j]:
         kind = "prismatic"
@@ -119,16 +119,19 @@ def _joint_of_arm(arm: MovedArm, j: int) -> _Joint:
 
 
 def _frame_at_zero(arm: MovedArm, link: int) -> np.ndarray:
-    """(4, 4) pose of a link with its joints at zero, in its frame with the first frame's angles."""
+    """(4, 4) pose of a link with its joints at zero, in the link's frame at the motion's start.
+
+    The joints are undone in reverse order.
+    """
     pose = np.eye(4)
     for j in np.flatnonzero(arm.joint_link == link)[::-1]:
-        way = -arm.joint_position[0, j] * arm.joint_axis[j]
+        undone = -arm.joint_position[0, j] * arm.joint_axis[j]  # (3,) m or rad
         if arm.joint_slides[j]:
             turn = Rotation.identity()
-            shift = way
+            shift = undone
         else:
             anchor = arm.joint_anchor[j]
-            turn = Rotation.from_rotvec(way)
+            turn = Rotation.from_rotvec(undone)
             shift = anchor - turn.apply(anchor)
         pose = pose @ pose_matrices(shift[None], turn)[0]
     return pose
@@ -147,15 +150,16 @@ def _add_joints(
     """Adds the joints between a link and its carrier, with the links between them.
 
     Args:
-      robot: the file.
-      joints: from the carrier to the link; a fixed joint follows if the last one's anchor is not
-        the link's origin.
+      robot: the element `robot`, to which they are added.
+      joints: joints of the link, in their order from its carrier; a fixed joint follows if the
+        anchor of the last one is not the link's origin, or if there are none.
       ends: carrier and link.
       place: (3,) position of the link in its carrier with all joints at zero, m.
       turn: rotation from the link's frame to its carrier's with all joints at zero.
     """
     carrier, link = ends
     for number, joint in enumerate(joints):
+        # In URDF a joint is at the origin of its child.
         is_last = number == len(joints) - 1 and np.allclose(joint.anchor, 0, atol=1e-9)
         child = link if is_last else f"{link}_{number}"
         origin = place + turn.apply(joint.anchor)
@@ -193,11 +197,12 @@ def _add_link(robot: ET.Element, name: str) -> ET.Element:
 def _add_joint(
     robot: ET.Element, name: str, kind: str, ends: _Ends, offset: np.ndarray, turn: Rotation
 ) -> ET.Element:
-    """Adds a joint at an offset (3,) and a rotation in its parent's frame."""
+    """Adds a joint at an offset (3,), m, and a rotation in its parent's frame."""
     joint = ET.SubElement(robot, "joint", name=name, type=kind)
     ET.SubElement(joint, "parent", link=ends.parent)
     ET.SubElement(joint, "child", link=ends.child)
-    with warnings.catch_warnings(action="ignore"):  # any roll will do at a pitch of 90 degrees
+    # At a pitch of 90 degrees, SciPy warns that roll and yaw are not unique.
+    with warnings.catch_warnings(action="ignore"):
         angles = turn.as_euler("xyz")
     ET.SubElement(joint, "origin", xyz=_numbers(offset), rpy=_numbers(angles))
     return joint
@@ -216,7 +221,9 @@ def _add_capsules(link: ET.Element, motion: Episode, index: int) -> None:
 
 
 def _add_visual(link: ET.Element, position: np.ndarray, angles: np.ndarray) -> ET.Element:
-    """Adds a shape at a position (3,) with angles (3,); returns its geometry."""
+    """Adds a shape at a position (3,), m, with roll, pitch and yaw (3,), rad; returns its element
+    `geometry`, which is empty.
+    """
     visual = ET.SubElement(link, "visual")
     ET.SubElement(visual, "origin", xyz=_numbers(position), rpy=_numbers(angles))
     return ET.SubElement(visual, "geometry")

@@ -1,8 +1,8 @@
 """USD as text (.usda) with time samples.
 
-One Xform a link, nested as hand and arm are, the hand's with USD's own capsules as guides; object
-and arm are meshes. The hand's surface is skinned: a skeleton of the links with an animation moves
-it (UsdSkel).
+Each link is an Xform, nested as in hand and arm. The hand's links have USD's capsules as guides;
+object and arm have meshes. The hand's surface is skinned: a skeleton of the links with an animation
+moves it (UsdSkel).
 """
 
 import json
@@ -22,6 +22,7 @@ from congrasp.services.export.texture_coordinates import Unwrapped, unwrapped
 from congrasp.services.viz.kernels import GAMMA
 
 _NAME = "congrasp:name"
+"""Attribute with the original name of a body, which need not be an identifier."""
 _DOUBLE = UsdGeom.XformOp.PrecisionDouble
 
 
@@ -56,15 +57,15 @@ def _add_bodies(stage: Usd.Stage, root: Sdf.Path, motion: Episode) -> list[Body]
     meshes_of_link = arm_meshes(motion)
     paths = [root]
     for i, (body, name) in enumerate(zip(motion_bodies, names, strict=True)):
-        path = paths[body.parent + 1].AppendChild(name)
+        path = paths[body.parent + 1].AppendChild(name)  # the first path is the root's
         paths.append(path)
         _add_transform(stage, path, body)
         if body.name == OBJECT:
             _add_object(stage, path.AppendChild("mesh"), motion)
         _add_capsules(stage, path, motion, i)
         for number, mesh in enumerate(meshes_of_link.get(body.name, ())):
-            place = path.AppendChild(f"mesh_{number}")
-            _add_mesh(stage, place, mesh.vertices, mesh.faces, mesh.colour, textured=False)
+            mesh_path = path.AppendChild(f"mesh_{number}")
+            _add_mesh(stage, mesh_path, mesh.vertices, mesh.faces, mesh.colour, textured=False)
     return motion_bodies
 
 
@@ -84,7 +85,7 @@ def _add_transform(stage: Usd.Stage, path: Sdf.Path, body: Body) -> None:
 
 
 def _add_object(stage: Usd.Stage, path: Sdf.Path, motion: Episode) -> None:
-    """Adds the object's mesh, in one colour or with those of its points."""
+    """Adds the object's mesh, in one colour or in those of its points."""
     vertices, faces, point_colours = object_mesh(motion)
     colours = COLOURS[OBJECT] if point_colours is None else point_colours
     _add_mesh(stage, path, vertices, faces, colours)
@@ -151,12 +152,12 @@ def _describe_animation(animation: UsdSkel.Animation, links: Sequence[Body]) -> 
     animation.CreateScalesAttr([Gf.Vec3h(1, 1, 1)] * len(links))
     quaternions = np.stack([link.quaternions(scalar_first=True) for link in links], 1)
     shape = (len(quaternions), 3)
-    places = np.stack([np.broadcast_to(link.translation, shape) for link in links], 1)
+    positions = np.stack([np.broadcast_to(link.translation, shape) for link in links], 1)
     rotations = animation.CreateRotationsAttr()
     translations = animation.CreateTranslationsAttr()
-    for t, place in enumerate(places):
+    for t, positions_at_t in enumerate(positions):
         rotations.Set([Gf.Quatf(*row) for row in quaternions[t].tolist()], t)
-        translations.Set(_vectors(place), t)
+        translations.Set(_vectors(positions_at_t), t)
 
 
 def _joint_paths(links: Sequence[Body]) -> list[str]:
@@ -185,10 +186,16 @@ def _add_mesh(
     *,
     textured: bool = True,
 ) -> UsdGeom.Mesh:
-    """Adds triangles (F, 3), not subdivided, of one sRGB colour (3,) or with that of each vertex
-    (V, 3).
+    """Adds triangles (F, 3) between vertices (V, 3), m, which readers must not subdivide.
 
-    Displayed colours are linear.
+    Args:
+      stage: the file.
+      path: path of the new mesh.
+      vertices: the vertices.
+      faces: the triangles.
+      colours: sRGB from 0 to 1, (3,) of the mesh or (V, 3) of its vertices; USD stores linear
+        colours.
+      textured: also adds texture coordinates.
     """
     mesh = UsdGeom.Mesh.Define(stage, path)
     points = _vectors(vertices)
@@ -215,5 +222,5 @@ def _add_texture_coordinates(mesh: UsdGeom.Mesh, flat: Unwrapped) -> None:
 
 
 def _vectors(values: np.ndarray) -> Vt.Vec3fArray:
-    """Vectors (n, 3) as USD's."""
+    """Converts vectors (n, 3) to an array of USD."""
     return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))

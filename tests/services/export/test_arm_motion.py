@@ -142,6 +142,18 @@ def test_every_reader_finds_the_arm_where_it_was(
     assert error_mm(motion, track) < 0.01
 
 
+def test_a_glb_leaves_out_flat_triangles_of_an_arm(motion: Episode, tmp_path: pathlib.Path) -> None:
+    arm = motion.arm
+    assert arm is not None
+    faces = arm.mesh_faces.copy()
+    faces[0] = faces[0, 0]
+    flat = dataclasses.replace(motion, arm=dataclasses.replace(arm, mesh_faces=faces))
+    path = tmp_path / "flat.glb"
+    formats.export_motions([flat], "glb", path)
+    base = trimesh.load_scene(path).geometry["odd_base"]
+    assert len(base.faces) == len(arm.meshes[0].faces) - 1
+
+
 def test_the_described_robot_is_mujocos(motion: Episode) -> None:
     """Joints alone take every link, the palm too, to where the motion has it."""
     arm = motion.arm
