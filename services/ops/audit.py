@@ -1,11 +1,12 @@
 """Audit: the outcome of every rollout of a run, from the journals of its actors and its learner.
 
-Actors record what they sent, with a checksum, and every reply; the learner records what it used,
-with a checksum from the start of the update, what it dropped, and where its sessions began and
-ended. Neither reads the other's journal, and this module does not use the code that decided.
+An actor's journal lists the rollouts that it sent, with checksums, and every reply. The learner's
+journal lists the rollouts that it used, with checksums from the start of the update, those that it
+dropped, and where its sessions began and ended. Neither process reads the other's journal, and this
+module uses the learner's code to read its files, but none that accepts or drops rollouts.
 
 The content of missing or damaged lines of a journal is unknown. Rollouts that they may concern are
-no faults, but are counted as not in the journals, and reported as unjudged. A journal without its
+not faults, but are counted as not in the journals, and reported as unjudged. A journal without its
 last lines is recognised by the note next to it (`common.io.journal_end`), by the newest version of
 the run's files, and by accepted rollouts without a file.
 """
@@ -32,7 +33,7 @@ from congrasp.learner.hub.write_ahead import stored
 from congrasp.learner.run_directory import version_of_files
 
 Identity = tuple[str, str, int]
-"""Actor, incarnation and sequence number."""
+"""Actor, incarnation and sequence number of a rollout."""
 FAULTS = {
     "lost": "loss",
     "duplicated": "surplus",
@@ -47,27 +48,29 @@ UNJUDGED = "not in the journals"
 """Outcome of accepted rollouts that cannot be judged."""
 
 
-class Made(NamedTuple):
+class SentRollout(NamedTuple):
     """A rollout as recorded by its actor."""
 
     version: int
+    """Version of its policy."""
     checksum: str
-    answers: list[tuple[str, str]]
-    """(outcome, session id of the learner)."""
+    replies: list[tuple[str, str]]
+    """Outcome and the learner's session id, for each reply."""
 
 
 class Report(NamedTuple):
     """Outcome of every rollout of a run."""
 
     counts: dict[str, int]
-    """Numbers of rollouts made and accepted, and the outcomes of accepted ones; the last ones are
-    faults.
-    """
+    """Number of rollouts by outcome; `made` and `accepted` are totals, the last are `FAULTS`."""
     faults: list[str]
     """One line for each rollout that was lost, duplicated, corrupted or unmatched."""
     lag_mean: float
+    """Mean lag of all used rollouts, versions."""
     lag_max: int
+    """Largest lag of a used rollout, versions."""
     max_staleness: int
+    """Largest limit on lag, versions."""
     holes: int
     """Lines missing from the journals because of a full disk, or cut at the end."""
     damaged: int
@@ -112,64 +115,64 @@ def compare(run_dir: pathlib.Path, more: Sequence[pathlib.Path] = ()) -> Report:
     """
     if not run_dir.is_dir():
         raise CongraspError(f"There is no folder {run_dir}.", "Pass the folder of a run.")
-    learners = _learner_journals(run_dir / AUDIT)
-    actors = _actor_journals(run_dir / AUDIT, learners, more)
+    learner_files = _learner_files(run_dir / AUDIT)
+    actor_files = _actor_files(run_dir / AUDIT, learner_files, more)
     # In this order, since a running learner writes meanwhile: a rollout that an actor knows to be
     # accepted, and that the learner has not used, is in one of the two listings of files.
-    notes = [read_journal(path, _is_entry) for path in actors]
+    of_actors = [read_journal(path, _is_entry) for path in actor_files]
     reached = version_of_files(run_dir)
     files = stored(run_dir)
-    books = [read_uses(path) for path in learners]
+    of_learners = [read_uses(path) for path in learner_files]
     if files is not None:
         files |= stored(run_dir) or set()
-    gaps = _Gaps(actors=_has_gaps(notes), learners=_has_gaps(books))
-    outcomes = _outcomes(book.intact for book in books)._replace(files=files)
-    report = _compare(_sent_rollouts(notes), outcomes, gaps, [*notes, *books])
-    covered = _covered_version(books)
+    gaps = _Gaps(actors=_has_gaps(of_actors), learners=_has_gaps(of_learners))
+    outcomes = _outcomes(journal.intact for journal in of_learners)._replace(files=files)
+    report = _compare(_sent_rollouts(of_actors), outcomes, gaps, [*of_actors, *of_learners])
+    covered = _covered_version(of_learners)
     if covered < reached and not gaps.learners:
         return report._replace(missing=report.missing + 1, unrecorded=(covered, reached))
     return report
 
 
-def _learner_journals(folder: pathlib.Path) -> list[pathlib.Path]:
+def _learner_files(folder: pathlib.Path) -> list[pathlib.Path]:
     """Returns the journals of a run's learners; raises a CongraspError if there are none."""
-    learners = sorted(folder.glob("learner-*.jsonl"))
-    if not learners:
+    files = sorted(folder.glob("learner-*.jsonl"))
+    if not files:
         raise CongraspError(
             f"There is no journal of a learner in {folder}.",
             "An actor in the learner's process ('--actors 0', '--inside') and '--no-audit' write "
             "no journal.",
         )
-    return learners
+    return files
 
 
-def _actor_journals(
-    folder: pathlib.Path, learners: Sequence[pathlib.Path], more: Sequence[pathlib.Path]
+def _actor_files(
+    folder: pathlib.Path, learner_files: Sequence[pathlib.Path], more: Sequence[pathlib.Path]
 ) -> list[pathlib.Path]:
     """Returns the journals of a run's actors: those in its folder, this user's, and more; raises a
     CongraspError if there are none.
     """
-    actors = [path for path in sorted(folder.glob("*.jsonl")) if path not in learners]
-    user_folders = _user_journals([read_uses(path) for path in learners])
+    files = [path for path in sorted(folder.glob("*.jsonl")) if path not in learner_files]
+    user_folders = _user_folders([read_uses(path) for path in learner_files])
     for user_folder in user_folders:
-        actors += sorted(user_folder.glob("*.jsonl"))
-    actors += more
-    if not actors:
-        places = " or ".join(str(each) for each in (folder, *user_folders))
+        files += sorted(user_folder.glob("*.jsonl"))
+    files += more
+    if not files:
+        places = " or ".join(str(place) for place in (folder, *user_folders))
         raise CongraspError(
             f"There is no journal of an actor in {places}.",
             "Copy the journals of actors on other machines from ~/.local/state/congrasp/audit "
             "there, and pass them with --journals FILE.",
         )
-    return actors
+    return files
 
 
 def _has_gaps(journals: Iterable[JournalLines]) -> bool:
     """True if any of the journals lacks lines."""
-    return any(each.lost or each.damaged or each.missing for each in journals)
+    return any(journal.lost or journal.damaged or journal.missing for journal in journals)
 
 
-def _covered_version(books: Iterable[JournalLines]) -> int:
+def _covered_version(journals: Iterable[JournalLines]) -> int:
     """Newest version that a run can have reached by its learners' journals.
 
     An update leads to one more than its line says, and so may every start of a session, which skips
@@ -177,19 +180,21 @@ def _covered_version(books: Iterable[JournalLines]) -> int:
     """
     newest = -1
     sessions = 0
-    for book in books:
-        for entry in book.intact:
+    for journal in journals:
+        for entry in journal.intact:
             sessions += "session_id" in entry
             if "version" in entry:
                 newest = max(newest, entry["version"] + ("used" in entry))
     return newest + sessions
 
 
-def _user_journals(books: Iterable[JournalLines]) -> list[pathlib.Path]:
-    """Folders in which actors of this user on this machine wrote the journals of these runs."""
+def _user_folders(journals: Iterable[JournalLines]) -> list[pathlib.Path]:
+    """Folders in which actors of this user on this machine keep the journals of a run, by the run
+    ids in its learners' journals.
+    """
     run_ids: set[str] = set()
-    for book in books:
-        run_ids |= {str(entry["run_id"]) for entry in book.intact if "run_id" in entry}
+    for journal in journals:
+        run_ids |= {str(entry["run_id"]) for entry in journal.intact if "run_id" in entry}
     folders: list[pathlib.Path] = []
     for run_id in sorted(run_ids):
         with contextlib.suppress(CongraspError):  # a damaged journal may name anything
@@ -206,26 +211,26 @@ def _is_entry(entry: dict[str, Any]) -> bool:
     return has_fields(entry, actor=str, incarnation=str)
 
 
-def _sent_rollouts(journals: Iterable[JournalLines]) -> dict[Identity, Made]:
+def _sent_rollouts(journals: Iterable[JournalLines]) -> dict[Identity, SentRollout]:
     """Rollouts sent by actors, and the replies they received."""
-    made: dict[Identity, Made] = {}
+    sent: dict[Identity, SentRollout] = {}
     for journal in journals:
-        who: tuple[str, str] | None = None
+        sender: tuple[str, str] | None = None
         for entry in journal.entries:
             if entry is None:
-                who = None  # unnamed lines that follow may belong to another incarnation
+                sender = None  # unnamed lines that follow may belong to another incarnation
                 continue
             if has_fields(entry, actor=str, incarnation=str):
-                who = entry["actor"], entry["incarnation"]
-            if who is None:
+                sender = entry["actor"], entry["incarnation"]
+            if sender is None:
                 continue
             if "made" in entry:
-                made[*who, entry["made"]] = Made(entry["version"], entry["checksum"], [])
+                sent[*sender, entry["made"]] = SentRollout(entry["version"], entry["checksum"], [])
                 continue
-            answered = made.get((*who, entry.get("answer", -1)))
-            if answered is not None:
-                answered.answers.append((entry["outcome"], entry["session_id"]))
-    return made
+            rollout = sent.get((*sender, entry.get("answer", -1)))
+            if rollout is not None:
+                rollout.replies.append((entry["outcome"], entry["session_id"]))
+    return sent
 
 
 @dataclasses.dataclass
@@ -236,59 +241,82 @@ class _Session:
     run_id: str
     version: int
     max_staleness: int
-    kept: bool
+    """Limit on lag, versions."""
+    writes_ahead: bool
     """Accepted rollouts were written to disk before the acknowledgement; older versions of congrasp
-    did not.
+    did not do so.
     """
-    falls_back: bool
+    fell_back: bool
     """It began from a checkpoint older than the newest, which was damaged or missing."""
-    started: bool
-    """It recovered rollouts from disk, after which it accepts."""
-    taken: set[Identity] = dataclasses.field(default_factory=set)
+    has_recovered: bool
+    """It has recovered the rollouts on disk, after which it accepts new ones."""
+    recovered: set[Identity] = dataclasses.field(default_factory=set)
+    """Rollouts of earlier sessions that it queued again."""
     unwritten: set[Identity] = dataclasses.field(default_factory=set)
-    saved: int = 0
+    """Accepted rollouts that could not be written to disk."""
+    checkpoint_version: int = 0
     """Version of its newest checkpoint."""
     waiting: set[Identity] | None = None
     """Queued rollouts at its end; None while it runs, or if it was killed."""
 
-    def had(self, identity: Identity, accepted_by: set[str]) -> bool:
-        """True if it accepted a rollout, or recovered it from an earlier session."""
-        return self.session_id in accepted_by or identity in self.taken
+    def has_accepted(self, identity: Identity, accepted_by: set[str]) -> bool:
+        """True if it accepted a rollout, or recovered it from an earlier session.
+
+        Args:
+          identity: the rollout.
+          accepted_by: ids of the sessions that accepted it, by its actor's journal.
+        """
+        return self.session_id in accepted_by or identity in self.recovered
 
 
 class _Outcomes(NamedTuple):
     """Actions of the learners on rollouts."""
 
-    books: list[list[_Session]]
-    """Sessions of each learner."""
-    standing: dict[Identity, list[Used]]
+    sessions_of_learners: list[list[_Session]]
+    """Sessions of each learner, in order."""
+    uses: dict[Identity, list[Used]]
+    """Uses by updates that no resume undid."""
     undone: set[Identity]
+    """Rollouts with a use that a resume undid."""
     dropped: set[Identity]
-    spoilt: set[Identity]
+    """Accepted rollouts that became too old."""
+    damaged_on_disk: set[Identity]
     files: set[Identity] | None = None
     """Accepted rollouts on disk; None if the run has no folder of them."""
 
 
-def _outcomes(books: Iterable[list[dict[str, Any]]]) -> _Outcomes:
-    """Collects outcomes from the learners' journals."""
-    outcomes = _Outcomes([], collections.defaultdict(list), set(), set(), set())
-    for book in books:
-        outcomes.books.append(_sessions(book))
-        stands, lost = replay(book)
-        for use in stands:
-            outcomes.standing[use.actor, use.incarnation, use.sequence].append(use)
-        outcomes.undone.update((use.actor, use.incarnation, use.sequence) for use in lost)
-        for entry in book:
-            outcomes.dropped.update(_rows(entry, "dropped"))
-            outcomes.spoilt.update(_rows(entry, "spoilt"))
+def _outcomes(journals: Iterable[list[dict[str, Any]]]) -> _Outcomes:
+    """Collects outcomes from the intact lines of each learner's journal."""
+    outcomes = _Outcomes(
+        sessions_of_learners=[],
+        uses=collections.defaultdict(list),
+        undone=set(),
+        dropped=set(),
+        damaged_on_disk=set(),
+    )
+    for entries in journals:
+        outcomes.sessions_of_learners.append(_sessions(entries))
+        uses, undone_uses = replay(entries)
+        for use in uses:
+            outcomes.uses[use.actor, use.incarnation, use.sequence].append(use)
+        for use in undone_uses:
+            outcomes.undone.add((use.actor, use.incarnation, use.sequence))
+        for entry in entries:
+            outcomes.dropped.update(_identities(entry, "dropped"))
+            outcomes.damaged_on_disk.update(_identities(entry, "spoilt"))
     return outcomes
 
 
-def _sessions(book: list[dict[str, Any]]) -> list[_Session]:
-    """Sessions of one learner, in order, without those killed before they recovered anything."""
+def _sessions(entries: list[dict[str, Any]]) -> list[_Session]:
+    """Sessions of one learner, in order, without those killed before they had recovered the
+    rollouts on disk.
+
+    Args:
+      entries: lines of its journal, as `used_rollouts.AuditLog` writes them.
+    """
     sessions: list[_Session] = []
-    saved = -1
-    for entry in book:
+    newest_checkpoint = -1
+    for entry in entries:
         if "session_id" in entry:
             writes_ahead = entry.get("kept") is True
             session = _Session(
@@ -296,27 +324,27 @@ def _sessions(book: list[dict[str, Any]]) -> list[_Session]:
                 run_id=entry["run_id"],
                 version=entry["version"],
                 max_staleness=entry["max_staleness"],
-                kept=writes_ahead,
-                falls_back=entry["version"] < saved,
-                started=not writes_ahead,
+                writes_ahead=writes_ahead,
+                fell_back=entry["version"] < newest_checkpoint,
+                has_recovered=not writes_ahead,
             )
             sessions.append(session)
-            saved = entry["version"]
-        saved = entry.get("saved", saved)
+            newest_checkpoint = entry["version"]
+        newest_checkpoint = entry.get("saved", newest_checkpoint)
         if not sessions:
             continue
         session = sessions[-1]
-        session.saved = saved
-        session.started |= "taken" in entry
-        session.taken.update(_rows(entry, "taken"))
-        session.unwritten.update(_rows(entry, "unwritten"))
+        session.checkpoint_version = newest_checkpoint
+        session.has_recovered |= "taken" in entry
+        session.recovered.update(_identities(entry, "taken"))
+        session.unwritten.update(_identities(entry, "unwritten"))
         if "end" in entry:
-            session.waiting = _rows(entry, "end")
-    return [session for session in sessions if session.started]
+            session.waiting = _identities(entry, "end")
+    return [session for session in sessions if session.has_recovered]
 
 
-def _rows(entry: dict[str, Any], name: str) -> set[Identity]:
-    """Rollouts named by a field of a line."""
+def _identities(entry: dict[str, Any], name: str) -> set[Identity]:
+    """Rollouts in the field `name` of a line."""
     return {(actor, incarnation, sequence) for actor, incarnation, sequence in entry.get(name, ())}
 
 
@@ -335,17 +363,20 @@ class _Findings:
 
 
 def _compare(
-    made: dict[Identity, Made], outcomes: _Outcomes, gaps: _Gaps, journals: Sequence[JournalLines]
+    sent: dict[Identity, SentRollout],
+    outcomes: _Outcomes,
+    gaps: _Gaps,
+    journals: Sequence[JournalLines],
 ) -> Report:
     """Compares every rollout's replies with the actions of the learner's sessions."""
     findings = _Findings()
-    findings.counts["made"] = len(made)
-    max_staleness = _max_staleness(outcomes.books)
-    for identity, text in _too_late(outcomes.standing, max_staleness):
+    findings.counts["made"] = len(sent)
+    max_staleness = _max_staleness(outcomes.sessions_of_learners)
+    for identity, text in _too_late(outcomes.uses, max_staleness):
         findings.add_fault("above the limit on lag", identity, text)
-    _check_uses(findings, made, outcomes, gaps)
-    _check_acceptances(findings, made, outcomes, gaps)
-    lags = _lags(outcomes.standing)
+    _check_uses(findings, sent, outcomes, gaps)
+    _check_acceptances(findings, sent, outcomes, gaps)
+    lags = _lags(outcomes.uses)
     counts = dict(findings.counts) | {name: findings.counts[name] for name in FAULTS}
     return Report(
         counts=counts,
@@ -361,15 +392,15 @@ def _compare(
 
 
 def _check_uses(
-    findings: _Findings, made: dict[Identity, Made], outcomes: _Outcomes, gaps: _Gaps
+    findings: _Findings, sent: dict[Identity, SentRollout], outcomes: _Outcomes, gaps: _Gaps
 ) -> None:
     """Compares the rollouts that the learners used with those that actors sent."""
-    incarnations = {identity[:2] for identity in made}
-    for identity, uses in outcomes.standing.items():
+    incarnations = {identity[:2] for identity in sent}
+    for identity, uses in outcomes.uses.items():
         if identity[:2] not in incarnations:
             findings.counts["of actors without a journal"] += 1
             continue
-        rollout = made.get(identity)
+        rollout = sent.get(identity)
         if rollout is None and gaps.actors:
             findings.counts["used, not in the journals"] += 1
         elif rollout is None:
@@ -382,16 +413,16 @@ def _check_uses(
 
 
 def _check_acceptances(
-    findings: _Findings, made: dict[Identity, Made], outcomes: _Outcomes, gaps: _Gaps
+    findings: _Findings, sent: dict[Identity, SentRollout], outcomes: _Outcomes, gaps: _Gaps
 ) -> None:
     """Counts the outcomes of the rollouts that actors sent, and finds accepted ones that were
     lost.
     """
-    for identity, rollout in made.items():
-        answers = [outcome for outcome, _ in rollout.answers]
-        if "accepted" not in answers and "duplicate" not in answers:
-            used = identity in outcomes.standing
-            findings.counts[_not_accepted(answers, used=used)] += 1
+    for identity, rollout in sent.items():
+        replies = [outcome for outcome, _ in rollout.replies]
+        if "accepted" not in replies and "duplicate" not in replies:
+            used = identity in outcomes.uses
+            findings.counts[_outcome_without_acceptance(replies, used=used)] += 1
             continue
         findings.counts["accepted"] += 1
         outcome = _judge(identity, rollout, outcomes, gaps)
@@ -401,97 +432,115 @@ def _check_acceptances(
             findings.counts[outcome] += 1
 
 
-def _not_accepted(outcomes: Sequence[str], *, used: bool) -> str:
+def _outcome_without_acceptance(replies: Sequence[str], *, used: bool) -> str:
     """Outcome of a rollout whose actor received no acceptance."""
     if used:
         return "used, answer lost"
-    return outcomes[-1] if outcomes else "unanswered"
+    return replies[-1] if replies else "unanswered"
 
 
-def _lags(standing: Mapping[Identity, list[Used]]) -> list[int]:
+def _lags(uses: Mapping[Identity, list[Used]]) -> list[int]:
     """Lags of all uses, versions."""
     lags: list[int] = []
-    for uses in standing.values():
-        lags += [use.lag for use in uses]
+    for uses_of_rollout in uses.values():
+        lags += [use.lag for use in uses_of_rollout]
     return lags
 
 
-def _too_late(
-    standing: Mapping[Identity, list[Used]], limit: int
-) -> Iterator[tuple[Identity, str]]:
-    """Yields the rollouts that were used more than `limit` versions after their policies."""
-    for identity, uses in standing.items():
-        lag = max(use.lag for use in uses)
+def _too_late(uses: Mapping[Identity, list[Used]], limit: int) -> Iterator[tuple[Identity, str]]:
+    """Yields the rollouts that were used more than `limit` versions after their policies, each
+    with the fault in words.
+    """
+    for identity, uses_of_rollout in uses.items():
+        lag = max(use.lag for use in uses_of_rollout)
         if lag > limit:
             yield identity, f"used {lag} versions after its policy; the limit is {limit}"
 
 
-def _max_staleness(books: Iterable[list[_Session]]) -> int:
+def _max_staleness(sessions_of_learners: Iterable[list[_Session]]) -> int:
     """Largest limit on lag of all sessions, versions."""
     limits = [0]
-    for book in books:
-        limits += [session.max_staleness for session in book]
+    for sessions in sessions_of_learners:
+        limits += [session.max_staleness for session in sessions]
     return max(limits)
 
 
-def _judge(identity: Identity, rollout: Made, outcomes: _Outcomes, gaps: _Gaps) -> str:
+def _judge(identity: Identity, rollout: SentRollout, outcomes: _Outcomes, gaps: _Gaps) -> str:
     """Outcome of an accepted rollout; a loss cannot be judged while lines are missing."""
     outcome = _outcome(identity, rollout, outcomes)
-    return UNJUDGED if outcome == "lost" and any(gaps) else outcome
+    if outcome == "lost" and any(gaps):
+        return UNJUDGED
+    return outcome
 
 
-def _outcome(identity: Identity, rollout: Made, outcomes: _Outcomes) -> str:
-    """Outcome of an accepted rollout, from the last session that had it and the next one."""
-    if identity in outcomes.standing:
+def _outcome(identity: Identity, rollout: SentRollout, outcomes: _Outcomes) -> str:
+    """Outcome of an accepted rollout, from the last session that accepted it and the next one."""
+    if identity in outcomes.uses:
         return "used"
     if identity in outcomes.dropped:
         return "dropped"
-    if identity in outcomes.spoilt:
+    if identity in outcomes.damaged_on_disk:
         return "damaged on disk"
-    accepted_by = {
-        session for outcome, session in rollout.answers if outcome in ("accepted", "duplicate")
-    }
-    for book in outcomes.books:
-        had = [n for n, session in enumerate(book) if session.had(identity, accepted_by)]
-        if not had:
+    accepted_by = set()
+    for reply, session_id in rollout.replies:
+        if reply in ("accepted", "duplicate"):
+            accepted_by.add(session_id)
+    for sessions in outcomes.sessions_of_learners:
+        accepting = [
+            n for n, session in enumerate(sessions) if session.has_accepted(identity, accepted_by)
+        ]
+        if not accepting:
             continue
-        newest = had[-1]
-        last = book[newest]
-        if newest + 1 == len(book):
-            return _at_the_end(identity, rollout.version, last, outcomes.files)
+        n = accepting[-1]
+        if n + 1 == len(sessions):
+            return _outcome_in_last_session(identity, rollout.version, sessions[n], outcomes.files)
         undone = identity in outcomes.undone
-        return _without_trace(identity, rollout.version, last, book[newest + 1], undone=undone)
+        return _outcome_after_restart(
+            identity, rollout.version, sessions[n], sessions[n + 1], undone=undone
+        )
     return UNJUDGED
 
 
-def _at_the_end(
+def _outcome_in_last_session(
     identity: Identity, version: int, last: _Session, files: set[Identity] | None
 ) -> str:
-    """Outcome of a rollout that the last session neither used nor dropped.
+    """Outcome of a rollout that the last session accepted and neither used nor dropped.
 
-    Without the session's end, its file shows that it waits. Rollouts that no resume could use have
-    no file: those of versions too far from that of the newest checkpoint.
+    If the session runs, or was killed, the rollout's file shows that it waits. Rollouts that no
+    resume could use have no file: their versions are too far from that of the newest checkpoint.
+
+    Args:
+      identity: the rollout.
+      version: version of its policy.
+      last: the learner's last session.
+      files: rollouts on disk; None if the run has no folder of them.
     """
     if last.waiting is not None:
         if identity in last.waiting:
             return "waiting"
         return "lost"
     has_file = files is None or identity in files
-    needs_file = last.kept and identity not in last.unwritten
-    if has_file or not needs_file or abs(version - last.saved) > last.max_staleness:
+    needs_file = last.writes_ahead and identity not in last.unwritten
+    if has_file or not needs_file or abs(version - last.checkpoint_version) > last.max_staleness:
         return "waiting"
     return UNJUDGED
 
 
-def _without_trace(
+def _outcome_after_restart(
     identity: Identity, version: int, last: _Session, after: _Session, *, undone: bool
 ) -> str:
-    """Reason why the session after the last that had a rollout did not recover it; "lost" without a
-    reason.
+    """Outcome of a rollout that the next session did not recover; "lost" without a reason.
+
+    Args:
+      identity: the rollout.
+      version: version of its policy.
+      last: the last session that had accepted it.
+      after: the session after that.
+      undone: True if an update used it and a resume undid the update.
     """
     if abs(version - after.version) > after.max_staleness or after.run_id != last.run_id:
         return "undone" if undone else "too old after a restart"
-    if not last.kept or identity in last.unwritten or after.falls_back:
+    if not last.writes_ahead or identity in last.unwritten or after.fell_back:
         return "undone" if undone else "not kept on disk"
     return "lost"
 

@@ -19,28 +19,32 @@ _MAX_QUOTED_CHARACTERS = 300
 """Limit of a quoted line."""
 _OUR_ERROR = "congrasp: error: "
 _PREFIX = re.compile(r"^(?:[EWFI]\d{4} [\d:.]+ +\d+ \S+\] |(?:error|fatal|warning|info): )+")
+"""Level, time and place in a line of XLA's log, and the level in a line of ours."""
 _HARMLESS = re.compile(r"not a failure|performance gains|retrying", re.IGNORECASE)
 """Lines about memory after which the allocator of a GPU tries again."""
 _TRACE = "Traceback (most recent call last):"
 _EXCEPTION = re.compile(r"^[A-Za-z_][\w.]*(?:: .*)?$")
+"""Line of an exception after its trace."""
 _CONSEQUENCES = re.compile(
     r"^(?:[\w.]*\.)?(?:BrokenPipeError|ConnectionResetError|ConnectionAbortedError|EOFError"
     r"|BrokenProcessPool|BrokenExecutor|KeyboardInterrupt|SystemExit)\b"
 )
 """Exceptions of a process that lost another one, or was asked to end."""
 _CRASH = re.compile(r"Fatal Python error|terminate called|panicked at|Check failed|LLVM ERROR")
+"""Last words of native code: the interpreter, C++, Rust, XLA and LLVM."""
 _ABORTS = platforms.signals_named("SIGABRT", "SIGSEGV", "SIGBUS", "SIGTRAP", "SIGILL")
 """Signals by which native code ends a process, for instance when it gets no memory."""
-
-
-_DRIVER = pathlib.Path("/dev/nvidiactl")
+_NVIDIA_DRIVER = pathlib.Path("/dev/nvidiactl")
+"""File that exists if the driver is loaded."""
 
 
 class Shortage(NamedTuple):
-    """A resource that a process can lack, and its symptoms."""
+    """A resource that a process can lack."""
 
     phrase: str
-    words: re.Pattern[str]
+    """The lack in a message."""
+    symptoms: re.Pattern[str]
+    """Matches lines of logs that report the lack."""
 
 
 _SHORTAGES = (
@@ -79,7 +83,7 @@ def read_end(path: pathlib.Path, begin: int) -> str:
     """Returns the end of a log from byte `begin` on, at most a mebibyte; empty if it is missing."""
     try:
         with path.open("rb") as log:
-            size = log.seek(0, 2)
+            size = log.seek(0, os.SEEK_END)
             log.seek(max(begin, size - _MAX_READ_BYTES))
             return log.read().decode(errors="replace")
     except OSError:
@@ -90,8 +94,8 @@ def cause_in(text: str) -> str:
     """Returns the cause of a process's end that its log shows, in one line; empty if it shows none.
 
     In this order: the first line about a lack of memory or threads, the error with which a command
-    ended, the last exception that is not the consequence of another one, and the last crash of
-    native code.
+    ended, the last exception (if possible one that is not the consequence of another process's
+    end), and the last crash of native code.
     """
     lines = text.splitlines()
     for line in lines:
@@ -103,8 +107,10 @@ def cause_in(text: str) -> str:
         return _quote(errors[-1].removeprefix(_OUR_ERROR))
     exceptions = _exception_lines(lines)
     causes = [line for line in exceptions if not _CONSEQUENCES.match(line)]
-    if causes or exceptions:
-        return _quote((causes or exceptions)[-1])
+    if causes:
+        return _quote(causes[-1])
+    if exceptions:
+        return _quote(exceptions[-1])
     crashes = [line for line in lines if _CRASH.search(line)]
     return _quote(crashes[-1]) if crashes else ""
 
@@ -144,23 +150,29 @@ def end_of(name: str, code: int, log: str, *, kernel_killed: bool = False) -> st
 
 
 def _find_shortage(line: str) -> Shortage | None:
-    """The resource whose lack a line reports."""
+    """Returns the lack that a line reports; None if it reports none."""
     if _HARMLESS.search(line):
         return None
-    return next((each for each in _SHORTAGES if each.words.search(line)), None)
+    for shortage in _SHORTAGES:
+        if shortage.symptoms.search(line):
+            return shortage
+    return None
 
 
 def _phrase_of(shortage: Shortage, text: str) -> str:
-    """Phrase of a shortage: memory of a device is that of a GPU if the log names one."""
-    if shortage.phrase == "out of device memory":
-        is_gpu = re.search(r"\bGPU|CUDA|\bgpu\b", text) or _uses_gpu()
-        return "out of GPU memory" if is_gpu else "out of memory"
-    return shortage.phrase
+    """Phrase of a shortage that a log reports. A device may be a GPU, or the CPU: it is a GPU if
+    the log names one, or this machine has one that JAX may use.
+    """
+    if shortage.phrase != "out of device memory":
+        return shortage.phrase
+    if re.search(r"\bGPU|CUDA|\bgpu\b", text) or _may_use_gpu():
+        return "out of GPU memory"
+    return "out of memory"
 
 
-def _uses_gpu() -> bool:
+def _may_use_gpu() -> bool:
     """True if this machine has an NVIDIA GPU and JAX may use it."""
-    return _DRIVER.exists() and os.environ.get("JAX_PLATFORMS") != "cpu"
+    return _NVIDIA_DRIVER.exists() and os.environ.get("JAX_PLATFORMS") != "cpu"
 
 
 def _exception_lines(lines: list[str]) -> list[str]:
@@ -177,13 +189,15 @@ def _exception_lines(lines: list[str]) -> list[str]:
 
 
 def _quote(line: str) -> str:
-    """A line of a log without its level, time and place."""
+    """A line of a log without its level, time and place, and with a limited length."""
     text = printable(_PREFIX.sub("", line.strip()).removeprefix(_OUR_ERROR)).strip().rstrip(". ")
     return text if len(text) <= _MAX_QUOTED_CHARACTERS else f"{text[:_MAX_QUOTED_CHARACTERS]} …"
 
 
 def _limit_sentence(cause: str) -> str:
-    """A sentence about the limit of the address space, if there is one and memory is the cause."""
+    """A sentence about the limit of the address space if there is one and memory is the cause, else
+    an empty text.
+    """
     limit = platforms.address_space_limit()
     if "memory" not in cause or not limit:
         return ""

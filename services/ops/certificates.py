@@ -2,8 +2,8 @@
 `human.actor.3`.
 
 The common name of a certificate is `<run>.<role>.<number>`. Zenoh compares whole common names and
-reads its rules once. Listeners therefore allow all numbers below `NUMBERS` from the start, and a
-certificate issued later works at once. A lost certificate is revoked: its common name is added to
+reads its rules once. Listeners therefore allow all numbers below `NUMBERS` from the start, so that
+a certificate issued later works at once. A lost certificate is revoked: its common name is added to
 the file `revoked`, which listeners check. Keys are elliptic (P-256), in files readable only by
 their owner.
 """
@@ -39,16 +39,17 @@ from congrasp.common.transport.security import (
 )
 
 CA_KEY_FILE = "ca.key"
+"""The authority's private key, which stays on the machine of its owner."""
 CA_DAYS = 3650
 """Validity of an authority."""
 DAYS = 365
-"""Validity of a role's certificate."""
+"""Default validity of a role's certificate."""
 RUN = "quickstart"
 """Default run of an authority."""
-_LONGEST_NAME = 64  # limit of a common name in characters (RFC 5280)
+_MAX_NAME_CHARACTERS = 64  # limit of a common name in characters (RFC 5280)
 _ORGANIZATION = "congrasp"
 _LOOPBACK = ("localhost", "127.0.0.1")
-_CLOCKS = datetime.timedelta(minutes=5)  # tolerance between the clocks of two machines
+_CLOCK_TOLERANCE = datetime.timedelta(minutes=5)  # tolerance between the clocks of two machines
 
 
 def create_authority(folder: pathlib.Path, *, run: str = RUN, force: bool = False) -> Certificate:
@@ -72,7 +73,7 @@ def create_authority(folder: pathlib.Path, *, run: str = RUN, force: bool = Fals
         [
             x509.NameAttribute(NameOID.ORGANIZATION_NAME, _ORGANIZATION),
             x509.NameAttribute(NameOID.ORGANIZATIONAL_UNIT_NAME, check_name("run", run)),
-            # Distinguishes authorities
+            # Two authorities of a run must not have the same name.
             x509.NameAttribute(NameOID.SERIAL_NUMBER, secrets.token_hex(8)),
         ]
     )
@@ -87,7 +88,7 @@ def create_authority(folder: pathlib.Path, *, run: str = RUN, force: bool = Fals
         encipher_only=False,
         decipher_only=False,
     )
-    made = (
+    certificate = (
         _builder(name, name, key.public_key(), CA_DAYS)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(usage, critical=True)
@@ -95,9 +96,9 @@ def create_authority(folder: pathlib.Path, *, run: str = RUN, force: bool = Fals
     )
     folder.mkdir(parents=True, exist_ok=True)
     _write_secret(folder / CA_KEY_FILE, key)
-    write_atomically(folder / CA_FILE, made.public_bytes(serialization.Encoding.PEM))
+    write_atomically(folder / CA_FILE, certificate.public_bytes(serialization.Encoding.PEM))
     (folder / REVOKED_FILE).unlink(missing_ok=True)
-    return Certificate(None, run, (), made.not_valid_after_utc)
+    return Certificate(None, run, (), certificate.not_valid_after_utc)
 
 
 def issue(
@@ -139,14 +140,13 @@ def issue(
             f"Only {' and '.join(LISTENERS)} can.",
         )
     ca, ca_key = _authority(folder)
-    identity = _free_identity(
-        folder, role, check_name("run", run or read(folder / CA_FILE).run), number, force
-    )
+    name_of_run = check_name("run", run or read(folder / CA_FILE).run)
+    identity = _free_identity(folder, role, name_of_run, number, force)
     key = ec.generate_private_key(ec.SECP256R1())
     common_name = x509.NameAttribute(NameOID.COMMON_NAME, str(identity))
     subject = x509.Name([x509.NameAttribute(NameOID.ORGANIZATION_NAME, _ORGANIZATION), common_name])
     builder = _builder(subject, ca.subject, key.public_key(), days, at_most=ca.not_valid_after_utc)
-    made = (
+    certificate = (
         _with_uses(builder, role, hosts)
         .add_extension(
             x509.AuthorityKeyIdentifier.from_issuer_public_key(ca_key.public_key()), critical=False
@@ -158,7 +158,7 @@ def issue(
         shutil.rmtree(target)
     target.mkdir(mode=0o700)
     _write_secret(target / KEY_FILE, key)
-    (target / CERTIFICATE_FILE).write_bytes(made.public_bytes(serialization.Encoding.PEM))
+    (target / CERTIFICATE_FILE).write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
     shutil.copyfile(folder / CA_FILE, target / CA_FILE)
     if (folder / REVOKED_FILE).exists():
         shutil.copyfile(folder / REVOKED_FILE, target / REVOKED_FILE)
@@ -170,9 +170,14 @@ def _free_identity(
 ) -> Identity:
     """Returns the identity of a new certificate; see `issue`."""
     revoked = Credentials(folder, role).revoked()
-    taken = lambda i: (folder / f"{role}.{i}").exists() or str(Identity(run, role, i)) in revoked  # noqa: E731
+
+    def is_taken(number: int) -> bool:
+        has_folder = (folder / f"{role}.{number}").exists()
+        return has_folder or str(Identity(run, role, number)) in revoked
+
     if number is None:
-        number = next((i for i in range(NUMBERS) if not taken(i)), NUMBERS)
+        # Without a free number, `NUMBERS` itself is rejected below.
+        number = next((i for i in range(NUMBERS) if not is_taken(i)), NUMBERS)
     if not 0 <= number < NUMBERS:
         raise CongraspError(
             f"{role}.{number} cannot be issued.", f"Numbers range from 0 to {NUMBERS - 1}."
@@ -185,9 +190,10 @@ def _free_identity(
         )
     if str(identity) in revoked:
         raise CongraspError(f"{identity} is revoked.", "Pass another --number.")
-    if len(str(identity)) > _LONGEST_NAME:
+    if len(str(identity)) > _MAX_NAME_CHARACTERS:
         raise CongraspError(
-            f"{identity} is longer than {_LONGEST_NAME} characters.", "Give the run a shorter name."
+            f"{identity} is longer than {_MAX_NAME_CHARACTERS} characters.",
+            "Give the run a shorter name.",
         )
     return identity
 
@@ -201,7 +207,7 @@ def _with_uses(
     uses = [ExtendedKeyUsageOID.CLIENT_AUTH]
     if role in LISTENERS:
         uses.append(ExtendedKeyUsageOID.SERVER_AUTH)
-        names = [_host(one) for one in dict.fromkeys((*_LOOPBACK, *hosts))]
+        names = [_host(host) for host in dict.fromkeys((*_LOOPBACK, *hosts))]
         builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
     builder = builder.add_extension(
         x509.BasicConstraints(ca=False, path_length=None), critical=True
@@ -228,12 +234,12 @@ def revoke(folder: pathlib.Path, role: str, number: int, *, run: str | None = No
     _authority(folder)
     name = str(Identity(run or read(folder / CA_FILE).run, role, number))
     names = sorted(Credentials(folder, role).revoked() | {name})
-    listed = "".join(f"{each}\n" for each in names)
+    lines = "".join(f"{revoked_name}\n" for revoked_name in names)
     folders = [folder]
     for issued_role in ROLES:
         folders += folder.glob(f"{issued_role}.*")
-    for place in folders:
-        write_atomically(place / REVOKED_FILE, listed.encode())
+    for certificate_folder in folders:
+        write_atomically(certificate_folder / REVOKED_FILE, lines.encode())
     return name
 
 
@@ -250,7 +256,8 @@ def certificates(folder: pathlib.Path) -> list[Certificate]:
             f"{folder} contains no certificates.",
             f"Create them: {shell_command('congrasp', 'certs', 'init', folder)}",
         )
-    return sorted(listed, key=lambda one: one.identity or Identity("", "", 0))
+    # The authority has no identity.
+    return sorted(listed, key=lambda certificate: certificate.identity or Identity("", "", 0))
 
 
 def _builder(
@@ -260,44 +267,66 @@ def _builder(
     days: float,
     at_most: datetime.datetime | None = None,
 ) -> x509.CertificateBuilder:
-    """Common fields of all certificates: names, key, serial number and validity."""
+    """Returns a builder with the fields of all certificates: names, key, serial number, validity.
+
+    Args:
+      subject: name of the owner.
+      issuer: name of the authority.
+      key: public key of the owner.
+      days: validity; below zero for a certificate that has expired.
+      at_most: latest end of the validity, if any.
+
+    Raises:
+      CongraspError: the validity is too long.
+    """
     now = datetime.datetime.now(datetime.UTC)
     if not -CA_DAYS <= days <= 2 * CA_DAYS:
         raise CongraspError(
             f"A certificate cannot be valid for {days:g} days.", f"Pass at most {2 * CA_DAYS}."
         )
     end = now + datetime.timedelta(days=days)
+    limited_end = min(end, at_most) if at_most else end
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
         .issuer_name(issuer)
         .public_key(key)
         .serial_number(x509.random_serial_number())
-        .not_valid_before(min(now, end) - _CLOCKS)
-        .not_valid_after(min(end, at_most) if at_most else end)
+        .not_valid_before(min(now, end) - _CLOCK_TOLERANCE)
+        .not_valid_after(limited_end)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
     )
 
 
 def _host(name: str) -> x509.GeneralName:
-    """Converts a host's name or address for a certificate."""
+    """Converts a host's name, which may begin with the wildcard `*.`, or its address.
+
+    Raises:
+      CongraspError: it is neither.
+    """
     try:
         return x509.IPAddress(ipaddress.ip_address(name))
     except ValueError:
         pass
     labels = name.removeprefix("*.").split(".")
-    if len(name) > 253 or not all(
-        0 < len(label) < 64 and label.replace("-", "a").isalnum() and label.isascii()
-        for label in labels
-    ):
+    if len(name) > 253 or not all(map(_is_label, labels)):  # RFC 1035
         raise CongraspError(
             f"{ascii(name)[:70]} is neither a host name nor an address.", "Correct --host."
         )
     return x509.DNSName(name)
 
 
+def _is_label(label: str) -> bool:
+    """True for one of the words of a host name, between its dots."""
+    return 0 < len(label) < 64 and label.replace("-", "a").isalnum() and label.isascii()
+
+
 def _authority(folder: pathlib.Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    """Loads certificate and key of the authority in a folder."""
+    """Loads certificate and key of the authority in a folder.
+
+    Raises:
+      CongraspError: there is none.
+    """
     try:
         key = serialization.load_pem_private_key((folder / CA_KEY_FILE).read_bytes(), None)
     except (OSError, ValueError):

@@ -1,5 +1,6 @@
 """`congrasp doctor`: checks of this machine and installation, each with a remedy if it fails."""
 
+import functools
 import importlib.metadata
 import os
 import pathlib
@@ -33,7 +34,7 @@ _MIN_DISK_MB_S = 5.0
 _SAMPLE_BYTES = 16 << 20
 """Size of the file that is written to measure a disk."""
 _MIN_DATE_S = 1.7e9
-"""Seconds since 1970, in the year 2023: an earlier clock is wrong."""
+"""Time in the year 2023, since 1970: an earlier clock is wrong."""
 _MAX_DRIFT_S = 0.1
 """Tolerated difference of two clocks over 0.2 s."""
 _MIN_DRIVER = 580
@@ -52,10 +53,12 @@ class Finding(NamedTuple):
     """Result of one check."""
 
     what: str
+    """Name of the part that was checked."""
     fine: bool
     state: str
+    """Facts about it, such as its version."""
     remedy: str = ""
-    """Problem and repair, for a failure."""
+    """Problem and repair; printed for a failure."""
 
     @property
     def text(self) -> str:
@@ -87,11 +90,11 @@ def examine(
         check_warp,
         check_ports,
     ]
-    checks += [lambda: check_disk(folder), check_clock]
+    checks += [functools.partial(check_disk, folder), check_clock]
     if certs:
-        checks.append(lambda: check_certificates(certs))
+        checks.append(functools.partial(check_certificates, certs))
     if connect:
-        checks.append(lambda: check_learner(connect, run, certs))
+        checks.append(functools.partial(check_learner, connect, run, certs))
     findings: list[Finding] = []
     for check in checks:
         findings += run_check(check)
@@ -103,12 +106,13 @@ def run_check(check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
     try:
         yield from check()
     except Exception as error:
-        name = getattr(check, "__name__", "check").strip("_<>").removeprefix("check_")
-        yield Finding(
-            name,
-            False,
-            f"could not be checked: {type(error).__name__}: {str(error).splitlines()[0]}",
-        )
+        function = getattr(check, "func", check)  # of a `functools.partial`
+        name = getattr(function, "__name__", "check").strip("_<>").removeprefix("check_")
+        reason = type(error).__name__
+        lines = str(error).splitlines()
+        if lines:
+            reason = f"{reason}: {lines[0]}"
+        yield Finding(name, False, f"could not be checked: {reason}")
 
 
 def check_python() -> Iterator[Finding]:
@@ -172,11 +176,10 @@ def check_gpu() -> Iterator[Finding]:
         yield Finding("gpu", False, "nvidia-smi does not respond", "install the NVIDIA driver")
         return
     for number, line in enumerate(lines):
-        name, memory, used, driver = (part.strip() for part in line.split(","))
+        name, total_mib, used_mib, driver = (column.strip() for column in line.split(","))
         fine = int(driver.split(".")[0]) >= _MIN_DRIVER
-        text = (
-            f"{name}, {int(memory) / 1024:.0f} GiB ({int(used) / 1024:.0f} used), driver {driver}"
-        )
+        memory = f"{int(total_mib) / 1024:.0f} GiB ({int(used_mib) / 1024:.0f} used)"
+        text = f"{name}, {memory}, driver {driver}"
         yield Finding(f"gpu {number}", fine, text, f"{_MIN_DRIVER} or newer is needed; update it")
 
 
@@ -189,13 +192,14 @@ def check_jax() -> Iterator[Finding]:
 
     devices = ", ".join(device.device_kind for device in jax.devices())
     backend = jax.default_backend()
-    computed = float(jax.jit(lambda x: (x * x).sum())(jnp.arange(4.0)))
-    missing = backend == "cpu" and os.path.exists(NVIDIA_DEVICE)
+    sum_of_squares = jax.jit(lambda x: (x * x).sum())
+    computed = float(sum_of_squares(jnp.arange(4.0)))
+    lacks_gpu = backend == "cpu" and os.path.exists(NVIDIA_DEVICE)
     remedy = "an NVIDIA GPU is not found; run: pip install 'congrasp[cuda]'"
-    if not missing:
+    if not lacks_gpu:
         remedy = f"a small program gave {computed}, not 14; reinstall it"
     text = f"{jax.__version__} on {backend} ({devices}), a small program runs"
-    yield Finding("jax", not missing and computed == 14.0, text, remedy)
+    yield Finding("jax", not lacks_gpu and computed == 14.0, text, remedy)
 
 
 def check_warp() -> Iterator[Finding]:
@@ -244,19 +248,14 @@ def check_ports() -> Iterator[Finding]:
 
 def check_disk(folder: pathlib.Path) -> Iterator[Finding]:
     """Checks free space of a folder's disk, and the speed of a synchronous write there."""
-    free = shutil.disk_usage(folder).free / 2**30
-    if free < _MIN_FREE_GIB:
-        remedy = f"a run needs about {_MIN_FREE_GIB:g} GiB; free some, or pass another --run-dir"
-        yield Finding("disk", False, f"{free:.1f} GiB free", remedy)
-        return
     try:
-        with tempfile.NamedTemporaryFile(dir=folder) as file:
-            sample = os.urandom(_SAMPLE_BYTES)
-            began = time.monotonic()
-            file.write(sample)
-            file.flush()
-            os.fsync(file.fileno())
-            speed = _SAMPLE_BYTES / 1e6 / (time.monotonic() - began)
+        free_gib = shutil.disk_usage(folder).free / 2**30
+        if free_gib < _MIN_FREE_GIB:
+            need = f"a run needs about {_MIN_FREE_GIB:g} GiB"
+            remedy = f"{need}; free some, or pass another --run-dir"
+            yield Finding("disk", False, f"{free_gib:.1f} GiB free", remedy)
+            return
+        speed = _write_speed_mb_s(folder)
     except OSError as error:
         yield Finding(
             "disk",
@@ -264,25 +263,33 @@ def check_disk(folder: pathlib.Path) -> Iterator[Finding]:
             f"{folder.absolute()} cannot be written: {error.strerror}; pass another --run-dir",
         )
         return
-    remedy = (
-        f"checkpoints and recordings need about {_MIN_DISK_MB_S:g} MB/s; pass another --run-dir"
-    )
-    yield Finding(
-        "disk", speed >= _MIN_DISK_MB_S, f"{free:.1f} GiB free, written at {speed:.0f} MB/s", remedy
-    )
+    text = f"{free_gib:.1f} GiB free, written at {speed:.0f} MB/s"
+    need = f"checkpoints and recordings need about {_MIN_DISK_MB_S:g} MB/s"
+    yield Finding("disk", speed >= _MIN_DISK_MB_S, text, f"{need}; pass another --run-dir")
+
+
+def _write_speed_mb_s(folder: pathlib.Path) -> float:
+    """Speed of a synchronous write to a temporary file in a folder, MB/s."""
+    sample = os.urandom(_SAMPLE_BYTES)
+    with tempfile.NamedTemporaryFile(dir=folder) as file:
+        start = time.monotonic()
+        file.write(sample)
+        file.flush()
+        os.fsync(file.fileno())
+        return _SAMPLE_BYTES / 1e6 / (time.monotonic() - start)
 
 
 def check_clock() -> Iterator[Finding]:
-    """Checks that the date is plausible, and that the monotonic clock runs at the same rate."""
+    """Checks that the date is plausible, and that it advances as the monotonic clock does."""
     date = time.time()
     monotonic = time.monotonic()
     time.sleep(0.2)
-    drift = abs((time.time() - date) - (time.monotonic() - monotonic))
+    drift_s = abs((time.time() - date) - (time.monotonic() - monotonic))
     is_behind = date < _MIN_DATE_S
-    remedy = f"it jumped by {drift:.2f} s in 0.2 s; check the time service"
+    remedy = f"it jumped by {drift_s:.2f} s in 0.2 s; check the time service"
     if is_behind:
         remedy = "it is years behind; set it (timedatectl set-ntp true)"
-    fine = not is_behind and drift <= _MAX_DRIFT_S
+    fine = not is_behind and drift_s <= _MAX_DRIFT_S
     yield Finding("clock", fine, time.strftime("%Y-%m-%d %H:%M:%S %Z"), remedy)
 
 
@@ -313,25 +320,26 @@ def check_learner(connect: str, run: str, certs: pathlib.Path | None = None) -> 
     """
     try:
         with urls.connect(connect, "observer", certs=certs, wait=5.0, run=run) as transport:
-            ask(transport, run)
+            ask(transport, run)  # the first request takes longer
             time.sleep(_REQUEST_PAUSE_S)
-            began = time.time()
+            start = time.time()
             status = ask(transport, run)
-            ended = time.time()
+            end = time.time()
     except CongraspError as error:
         yield Finding("learner", False, str(error))
         return
     yield Finding(
         "learner",
         True,
-        f"{connect} responds in {1e3 * (ended - began):.1f} ms, version {status['version']}",
+        f"{connect} responds in {1e3 * (end - start):.1f} ms, version {status['version']}",
     )
-    offset = status["time"] - (began + ended) / 2
-    fine = abs(offset) < _MAX_CLOCK_OFFSET_S + (ended - began) / 2
+    # The learner read its clock at some time between the request and the reply.
+    offset_s = status["time"] - (start + end) / 2
+    uncertainty_s = (end - start) / 2
+    fine = abs(offset_s) < _MAX_CLOCK_OFFSET_S + uncertainty_s
+    text = f"{offset_s:+.3f} s from this one (± {uncertainty_s:.3f})"
     remedy = "times in recordings will not match; synchronise both clocks"
-    yield Finding(
-        "its clock", fine, f"{offset:+.3f} s from this one (± {(ended - began) / 2:.3f})", remedy
-    )
+    yield Finding("its clock", fine, text, remedy)
 
 
 def doctor(

@@ -59,22 +59,22 @@ class Connection(H11Protocol):
         if self._place is None:
             return
         self._head_deadline.cancel()
-        self._end_reading_deadline()
+        self._cancel_reading_deadline()
         self.config.places.leave(self._place)
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Reads bytes of a request."""
+        """Reads bytes of a request; the deadline ends with its head."""
         cycle = self.cycle
         super().data_received(data)
-        if self.cycle is not cycle:
+        if self.cycle is not cycle:  # uvicorn makes one for each complete head
             self._head_deadline.cancel()
 
     def on_response_complete(self) -> None:
         """Waits for the next request, unless it has already arrived."""
         cycle = self.cycle
         super().on_response_complete()
-        if self.cycle is not cycle:
+        if self.cycle is not cycle:  # the head of the next request
             return
         seconds = TIMEOUT_S
         if self.conn.their_state is h11.SEND_BODY:
@@ -89,13 +89,13 @@ class Connection(H11Protocol):
     def resume_writing(self) -> None:
         """Continues after the client has read everything."""
         super().resume_writing()
-        self._end_reading_deadline()
+        self._cancel_reading_deadline()
 
     def _await_head(self, seconds: float) -> None:
         """Ends the connection unless a request's head arrives in time, at whatever speed."""
         self._head_deadline = self.loop.call_later(seconds, self.transport.abort)
 
-    def _end_reading_deadline(self) -> None:
-        """Forgets the deadline for an answer."""
+    def _cancel_reading_deadline(self) -> None:
+        """Cancels the deadline for an answer, if there is one."""
         if self._reading_deadline is not None:
             self._reading_deadline.cancel()

@@ -9,9 +9,10 @@ import uvicorn
 from congrasp.common.transport.places import Places
 from congrasp.services.ops.http_connections import TIMEOUT_S, ConnectionConfig
 
-_QUEUE = 128
-"""Connections that wait to be accepted; a client retries after a second if there are more."""
-_CLOSING_S = 1
+_MAX_WAITING = 128
+"""Most connections that wait to be accepted; beyond them, a client's system retries after a
+second."""
+_CLOSING_TIMEOUT_S = 1
 """Time for the requests in progress when the server stops."""
 _JOIN_TIMEOUT_S = 2.0
 
@@ -22,7 +23,7 @@ class HttpServer:
     def __init__(
         self, application: Any, listener: socket.socket, max_connections: int, **settings: Any
     ):
-        """Serves.
+        """Starts the server's thread.
 
         Args:
           application: an ASGI application.
@@ -41,7 +42,7 @@ class HttpServer:
             proxy_headers=False,
             server_header=False,
             timeout_keep_alive=int(TIMEOUT_S),
-            timeout_graceful_shutdown=_CLOSING_S,
+            timeout_graceful_shutdown=_CLOSING_TIMEOUT_S,
             **settings,
         )
         self._server = uvicorn.Server(config)
@@ -57,7 +58,7 @@ class HttpServer:
 
 
 def listening_socket(host: str, port: int) -> socket.socket:
-    """Returns a socket that listens at an interface.
+    """Returns a socket that listens on a port of the interface with the address or name `host`.
 
     Raises:
       OSError: the port is busy, or there is no such interface.
@@ -68,7 +69,7 @@ def listening_socket(host: str, port: int) -> socket.socket:
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, port))
-        listener.listen(_QUEUE)
+        listener.listen(_MAX_WAITING)
     except BaseException:
         listener.close()
         raise

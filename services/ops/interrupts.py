@@ -27,8 +27,8 @@ def interrupts_reach(stop: Stop) -> Iterator[None]:
     """
     previous_hook = sys.unraisablehook
     ended = threading.Event()
+    # Held while the interrupt is raised again, so that the context ends either before or after it.
     ending = threading.Lock()
-    """Held while the interrupt is raised again, so that the context ends before or after it."""
 
     def raise_unless_ended() -> None:
         with ending:
@@ -67,7 +67,7 @@ def check_stopped() -> None:
 def raise_in_main_thread() -> None:
     """Raises KeyboardInterrupt in the main thread, between two bytecodes.
 
-    It is no signal, since a second one ends the process at once (`lifetime.on_signal`).
+    It sends no signal, since a second one would end the process at once (`lifetime.on_signal`).
     """
     thread_id = ctypes.c_ulong(threading.main_thread().ident or 0)
     exception = ctypes.py_object(KeyboardInterrupt)

@@ -27,15 +27,15 @@ GRACE_WITHOUT_CHILDREN_S = 1.7
 """The same for a command that a signal interrupts and that has no children: it has nothing to
 drain, and its files are complete or absent."""
 CHILD_GRACE_S = 2.0
-"""Longest time for a child to drain. It is shorter than `GRACE_S`, which leaves this process time
-to kill the child.
+"""Longest time for a child to drain. It is shorter than `GRACE_S`, so that this process has time
+left to kill the child.
 """
 SIGNALS = "signals"
 """Name of the thread that acts on signals; it runs no native code."""
 PARENT_VARIABLE = "CONGRASP_PARENT"
 """Environment variable with the parent's process number, which makes a child end with it."""
 POLL_S = 0.5
-"""Time between two looks at a child, s."""
+"""Time between two checks of a child."""
 _KILL_TIMEOUT_S = 0.5
 """Deadline for the end of all killed children."""
 _children: weakref.WeakSet[subprocess.Popen[bytes]] = weakref.WeakSet()
@@ -97,8 +97,8 @@ def on_signal(grace: float | None = None, *, interrupt: bool = False) -> Iterato
             raise KeyboardInterrupt
 
     obeyed = [number for number in platforms.STOP_SIGNALS if _is_obeyed(number)]
-    previous = {number: signal.signal(number, handle) for number in obeyed}
-    wakeup = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+    previous_handlers = {number: signal.signal(number, handle) for number in obeyed}
+    previous_wakeup = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
     watch = threading.Thread(
         target=_watch_signals, args=(reader, stop, grace, interrupt), daemon=True, name=SIGNALS
     )
@@ -106,21 +106,23 @@ def on_signal(grace: float | None = None, *, interrupt: bool = False) -> Iterato
     try:
         yield stop
     finally:
-        signal.set_wakeup_fd(wakeup)
-        for number, handler in previous.items():
+        signal.set_wakeup_fd(previous_wakeup)
+        for number, handler in previous_handlers.items():
             signal.signal(number, handler)
         writer.close()
 
 
 def _is_obeyed(number: signal.Signals) -> bool:
-    """False for the end of a terminal under `nohup`."""
+    """False for the signal of a closed terminal under `nohup`, which ignores it."""
     return number.name != "SIGHUP" or signal.getsignal(number) is not signal.SIG_IGN
 
 
 def _default_grace(interrupt: bool) -> float:
     """Seconds from a signal to the forced end of this process."""
     has_children = any(child.poll() is None for child in list(_children))
-    return GRACE_WITHOUT_CHILDREN_S if interrupt and not has_children else GRACE_S
+    if interrupt and not has_children:
+        return GRACE_WITHOUT_CHILDREN_S
+    return GRACE_S
 
 
 def _watch_signals(reader: socket.socket, stop: Stop, grace: float | None, interrupt: bool) -> None:
@@ -133,15 +135,15 @@ def _watch_signals(reader: socket.socket, stop: Stop, grace: float | None, inter
       grace: seconds to the forced end; by default `GRACE_S`, or `GRACE_WITHOUT_CHILDREN_S`.
       interrupt: True if signals also raise KeyboardInterrupt in the main thread.
     """
-    signals = reader.recv(1)
-    if not signals:
+    numbers = reader.recv(1)
+    if not numbers:
         return
-    stop.signal = platforms.stop_signal(signals[0])
+    stop.signal = platforms.stop_signal(numbers[0])
     stop.set()
-    seconds = grace or _default_grace(interrupt)
-    deadline = time.monotonic() + seconds
-    cause = f"it did not end within {seconds:g} s"
-    reader.settimeout(seconds)
+    grace_s = grace or _default_grace(interrupt)
+    deadline = time.monotonic() + grace_s
+    cause = f"it did not end within {grace_s:g} s"
+    reader.settimeout(grace_s)
     try:
         if reader.recv(1):
             cause = "a second signal came"
@@ -161,7 +163,7 @@ def _write_last_line(text: str) -> None:
 
 
 def _end(code: int) -> None:
-    """Ends this process at once, after its children."""
+    """Kills this process's children and ends it at once."""
     children = list(_children)
     for child in children:
         child.kill()
@@ -170,7 +172,9 @@ def _end(code: int) -> None:
 
 
 def follow_parent() -> None:
-    """Makes this process receive SIGTERM when its parent has ended, if that requested it."""
+    """Makes this process receive SIGTERM when its parent has ended, if the parent requested it (a
+    `Child` sets `PARENT_VARIABLE`).
+    """
     parent = os.environ.pop(PARENT_VARIABLE, None)
     if parent is not None:
         platforms.terminate_with(int(parent))
@@ -187,7 +191,7 @@ def command(*words: object, **options: object) -> list[str]:
             continue
         arguments.append(f"--{name.replace('_', '-')}")
         if isinstance(value, tuple):
-            arguments += [str(each) for each in value]
+            arguments += map(str, value)
         elif value is not True:
             arguments.append(str(value))
     return arguments
@@ -199,9 +203,13 @@ class Child:
 
     name: str
     arguments: list[str]
+    """Words of its command after `congrasp`."""
     log: pathlib.Path
+    """File that gets its output."""
     environment: dict[str, str] = dataclasses.field(default_factory=dict)
+    """Variables in addition to those of this process."""
     process: subprocess.Popen[bytes] | None = None
+    """None before it starts."""
     restarts: int = 0
     deaths: int = 0
     """Deaths since the run last made progress."""
@@ -230,8 +238,8 @@ class Child:
         environment.setdefault("JAX_TRACEBACK_FILTERING", "off")
         self.memory_kills = _memory_kills()
         with os_errors_as(f"{self.log} cannot be opened"):
-            opened = open_to_append(self.log)
-        with opened as log:
+            log_file = open_to_append(self.log)
+        with log_file as log:
             self.log_start = log.seek(0, os.SEEK_END)
             self.process = subprocess.Popen(
                 self.program,
@@ -241,25 +249,27 @@ class Child:
                 env=environment,
                 **platforms.separate_session(),
             )
-        _children.add(self.process)  # which a forced end of this process kills as well
+        _children.add(self.process)  # a forced end of this process kills it as well
         return self.process.pid
 
     @property
     def code(self) -> int | None:
         """Its exit code; None before it starts and while it runs."""
-        return self.process.poll() if self.process else None
+        if self.process is None:
+            return None
+        return self.process.poll()
 
     def last_line(self) -> str:
         """The last line that it wrote to its log."""
         return causes.last_line(self._output()) or "its log is empty"
 
     def cause(self) -> str:
-        """The cause of its end by its log, or else the last line, as a sentence."""
+        """The cause of its end by its log, else the log's last line, as a sentence."""
         cause = causes.cause_in(self._output()) or self.last_line()
         return f"{cause.rstrip('. ')}."
 
     def death(self) -> str:
-        """Its end in a sentence: the signal that killed it or its exit code, and the cause."""
+        """Describes its end in a sentence: the signal or the exit code, and the cause."""
         code = self.code or 0
         kernel_killed = _memory_kills() > self.memory_kills
         return causes.end_of(self.name, code, self._output(), kernel_killed=kernel_killed)
@@ -311,10 +321,10 @@ def run_child(
     Returns:
       Its exit code; None if it was terminated.
     """
-    began = time.monotonic()
+    deadline = time.monotonic() + patience
     try:
         child.start()
-        while child.code is None and time.monotonic() - began < patience:
+        while child.code is None and time.monotonic() < deadline:
             progress(child.last_line())
             time.sleep(POLL_S)
         code = child.code

@@ -22,19 +22,19 @@ _logger = logging.getLogger("congrasp")
 class JsonLines(logging.Formatter):
     """Records as JSON: time (ISO 8601, UTC), level, role, id, run, text, and additional fields."""
 
-    def __init__(self, **who: str):
-        """Adds the entries `who` to every line."""
+    def __init__(self, **process: str):
+        """Adds the entries `process` (role, id, run) to every line."""
         super().__init__()
-        self._who = who
+        self._process = process
 
     def format(self, record: logging.LogRecord) -> str:
-        """One line."""
+        """Returns one line."""
         entry: dict[str, Any] = {
             "time": datetime.datetime.fromtimestamp(record.created, datetime.UTC).isoformat(
                 timespec="milliseconds"
             ),
             "level": record.levelname.lower(),
-            **self._who,
+            **self._process,
             "text": record.getMessage(),
         }
         if record.exc_info:
@@ -60,6 +60,12 @@ def logging_as(form: LogFormat, *, role: str, id: str, run: str) -> Iterator[Non
 
     A full disk loses lines, but does not end the process. After an exception a JSON log continues
     until `log_error`, for the lines of outer contexts.
+
+    Args:
+      form: text or JSON.
+      role: role of the process.
+      id: its name.
+      run: name of its run.
     """
     root = logging.getLogger()
     handler = logging.StreamHandler(sys.stdout)
@@ -67,6 +73,7 @@ def logging_as(form: LogFormat, *, role: str, id: str, run: str) -> Iterator[Non
     if form == "json":
         formatter = JsonLines(role=role, id=id, run=run)
     handler.setFormatter(formatter)
+    # By default a line that cannot be written prints a trace to stderr.
     handler.handleError = lambda record: None  # type: ignore[method-assign]
     root.addHandler(handler)
     _logger.setLevel(logging.INFO)
@@ -76,7 +83,7 @@ def logging_as(form: LogFormat, *, role: str, id: str, run: str) -> Iterator[Non
             yield
         except Exception:
             if form == "json":
-                ending.pop_all()
+                ending.pop_all()  # keeps the handler
             raise
 
 
@@ -127,17 +134,17 @@ def announce_progress(
       every: seconds between two lines.
     """
     done = threading.Event()
-    began = time.monotonic()
+    start = time.monotonic()
 
-    def tell() -> None:
-        """Prints until it is done."""
-        pause = first
-        while not done.wait(pause):
+    def print_lines() -> None:
+        """Prints lines until the context ends."""
+        pause_s = first
+        while not done.wait(pause_s):
             task = what if isinstance(what, str) else what()
-            print(f"{task}: {time.monotonic() - began:.0f} s so far.", file=sys.stderr, flush=True)
-            pause = every
+            print(f"{task}: {time.monotonic() - start:.0f} s so far.", file=sys.stderr, flush=True)
+            pause_s = every
 
-    threading.Thread(target=tell, daemon=True, name="progress").start()
+    threading.Thread(target=print_lines, daemon=True, name="progress").start()
     try:
         yield
     finally:
@@ -149,9 +156,9 @@ def log_error(text: str) -> bool:
     log.
     """
     root = logging.getLogger()
-    ended = [handler for handler in root.handlers if isinstance(handler.formatter, JsonLines)]
-    if ended:
+    handlers = [handler for handler in root.handlers if isinstance(handler.formatter, JsonLines)]
+    if handlers:
         log("error", text)
-    for handler in ended:
+    for handler in handlers:
         root.removeHandler(handler)
-    return bool(ended)
+    return bool(handlers)

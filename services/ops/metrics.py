@@ -11,6 +11,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from congrasp.common.errors import TransportError
 
 _TICKETS = ("granted", "redeemed", "returned", "expired")
+"""Counters of tickets; the other counters are of rollouts, or in `_GAUGES`."""
 _GAUGES = {
     "running": ("tickets_running", "Tickets in use."),
     "capacity": (
@@ -31,7 +32,7 @@ class LearnerMetrics:
     """Status of a learner at the time of the scrape, and the metrics of its last update."""
 
     def __init__(self, ask: Callable[[], Mapping[str, Any]]):
-        """Uses a function with the result of `services.ops.status.ask`."""
+        """Uses `ask`, a function that returns the status as `services.ops.status.ask` does."""
         self._ask = ask
         self._values: Mapping[str, float] = {}
 
@@ -80,8 +81,10 @@ class LearnerMetrics:
         for name, value in counters.items():
             if name in _GAUGES:
                 yield _gauge(*_GAUGES[name], value)
-            elif name != "queued":
-                (tickets if name in _TICKETS else rollouts).add_metric([name], value)
+            elif name in _TICKETS:
+                tickets.add_metric([name], value)
+            elif name != "queued":  # the gauge `queue_length`
+                rollouts.add_metric([name], value)
         yield from (tickets, rollouts)
 
     @staticmethod
@@ -116,10 +119,11 @@ class LearnerMetrics:
 def _gauge(
     name: str, help: str, value: float | None = None, labels: Sequence[str] | None = None
 ) -> GaugeMetricFamily:
-    """Returns a gauge of the learner, with its prefix."""
-    return GaugeMetricFamily(
-        f"congrasp_learner_{name}", help, None if value is None else float(value), labels
-    )
+    """Returns a gauge of the learner, with its prefix; either with a value or with labels."""
+    number = None
+    if value is not None:
+        number = float(value)
+    return GaugeMetricFamily(f"congrasp_learner_{name}", help, number, labels)
 
 
 class ActorMetrics:

@@ -28,7 +28,7 @@ def serve_metrics(port: int, host: str, *collectors: Any) -> Iterator[None]:
     Raises:
       CongraspError: the port cannot be used.
     """
-    # Collectors need no `describe`: names are not checked for clashes
+    # Without `auto_describe` the names are not compared, for which every collector would be called.
     registry = CollectorRegistry()
     ProcessCollector(registry=registry)
     for collector in collectors:

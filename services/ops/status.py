@@ -28,7 +28,7 @@ _SUMS = {
     "granted": ("running", "redeemed", "returned", "expired"),
     "accepted": ("consumed", "dropped", "queued"),
 }
-"""Counters that are sums of others: no ticket and no accepted rollout is lost."""
+"""Counters that must be the sum of others, if no ticket and no accepted rollout is lost."""
 _TEXT_COLUMNS = ("role", "name", "incar-\nnation")
 _NUMBER_COLUMNS = ("version", "lag", "rollouts", "rollouts\nper s", "steps\nper s")
 """Titles of at most eight characters a line: all columns fit into 80."""
@@ -38,7 +38,7 @@ _DEFAULT_RUN = "quickstart"
 
 
 def ask(transport: Transport, run: str) -> dict[str, Any]:
-    """Queries the status of a run from its learner, with `warnings` (see there).
+    """Queries the status of a run from its learner, and adds its `warnings` (see this function).
 
     Raises:
       TransportError: no learner of this run responds.
@@ -49,14 +49,14 @@ def ask(transport: Transport, run: str) -> dict[str, Any]:
 
 
 def follow(transport: Transport, run: str, every: float) -> Iterator[dict[str, Any] | None]:
-    """Yields the status periodically; None while the learner is disconnected."""
+    """Yields the status every `every` seconds; None while the learner is disconnected."""
     while True:
-        began = time.monotonic()
+        start = time.monotonic()
         try:
             yield ask(transport, run)
         except TransportError:
             yield None
-        time.sleep(max(0.0, every - (time.monotonic() - began)))
+        time.sleep(max(0.0, start + every - time.monotonic()))
 
 
 def warnings(status: Mapping[str, Any]) -> list[str]:
@@ -64,9 +64,9 @@ def warnings(status: Mapping[str, Any]) -> list[str]:
     counters = status["counters"]
     queue = status["queue"]
     texts: list[str] = []
-    for total, parts in _SUMS.items():
-        if counters[total] != sum(counters[part] for part in parts):
-            terms = " + ".join(f"{part} {counters[part]}" for part in parts)
+    for total, addends in _SUMS.items():
+        if counters[total] != sum(counters[name] for name in addends):
+            terms = " + ".join(f"{name} {counters[name]}" for name in addends)
             texts.append(
                 f"The counters are inconsistent: {total} {counters[total]} is not {terms}."
             )
@@ -89,15 +89,15 @@ def tables(status: Mapping[str, Any]) -> Group:
         f"{rates['rollouts_per_second']:.2f} rollouts/s, {rates['steps_per_second']:.0f} steps/s; "
         f"{queue['length']} rollout(s) of at most {queue['limit']} waiting"
     )
-    parts: list[Table | Text] = [_roles_table(status)]
+    sections: list[Table | Text] = [_roles_table(status)]
     more = len(status["roles"][_MAX_ROWS:]) + status["unlisted"]
     if more:
-        parts.append(Text(f"{more} more live process(es)."))
-    parts.append(_counters_table(status["counters"]))
-    parts.append(Text(line))
+        sections.append(Text(f"{more} more live process(es)."))
+    sections.append(_counters_table(status["counters"]))
+    sections.append(Text(line))
     for warning in status["warnings"]:
-        parts.append(Text(f"Warning: {warning}", style="yellow"))
-    return Group(*parts)
+        sections.append(Text(f"Warning: {warning}", style="yellow"))
+    return Group(*sections)
 
 
 def _roles_table(status: Mapping[str, Any]) -> Table:
@@ -123,7 +123,9 @@ def _roles_table(status: Mapping[str, Any]) -> Table:
 
 
 def _cell(name: str) -> Text:
-    """Cell with the beginning of a name in ASCII, which strangers choose."""
+    """Cell with the beginning of a name. Other processes choose it, so that it may contain any
+    characters.
+    """
     return Text(ascii(name)[1:70].rstrip("'"))
 
 
@@ -137,7 +139,7 @@ def _role_numbers(role: Mapping[str, Any], learner_version: int) -> list[str]:
 
 
 def _counters_table(counters: Mapping[str, int]) -> Table:
-    """Table of the counters, with the terms of those that are sums."""
+    """Table of the counters, with the addends of those that are sums."""
     table = Table(title="Counters: tickets and rollouts")
     table.add_column("count")
     table.add_column("number", justify="right")
@@ -178,7 +180,7 @@ class Status:
     """
 
     def __call__(self) -> int:
-        """Prints the status."""
+        """Prints the status, and returns the exit code."""
         connect = self.connect
         run = self.run
         if self.run_dir is not None:

@@ -17,7 +17,8 @@ _FIRST_LINE_AFTER_S = 2.0
 _LINE_PERIOD_S = 60.0
 """Time between two lines."""
 _ATTEMPT_S = 1.0
-"""Longest time of one attempt, after which a signal is noticed."""
+"""Longest time of one attempt, after which a signal is noticed, and least time between the starts
+of two attempts."""
 
 
 def connect_when_up(
@@ -72,14 +73,14 @@ def when_up(
       TransportError: the attempts did not succeed in time.
       RefusedError: the peer refuses this process.
     """
-    began = time.monotonic()
-    limit = math.inf if patience is None else patience
-    next_line = began + _FIRST_LINE_AFTER_S
+    start = time.monotonic()
+    limit_s = math.inf if patience is None else patience
+    next_line = start + _FIRST_LINE_AFTER_S
     while not stop.is_set():
-        attempted = time.monotonic()
+        attempt_start = time.monotonic()
         try:
             result = attempt()
-        except RefusedError:
+        except RefusedError:  # a TransportError that a further attempt would not change
             raise
         except TransportError as error:
             reason = str(error)
@@ -88,14 +89,16 @@ def when_up(
                 return result
             reason = "There is no policy yet."
         now = time.monotonic()
-        if now - began >= limit:
+        if now - start >= limit_s:
             raise TransportError(
-                f"No response from {what} for {limit:g} s: {reason}",
+                f"No response from {what} for {limit_s:g} s: {reason}",
                 "Start it, or pass a longer --patience.",
             )
         if now >= next_line:
-            ends = "" if patience is None else f", up to {limit:g} s"
-            log("info", f"Waiting for {what}, {now - began:.0f} s so far{ends}. {reason}")
+            end = "" if patience is None else f", up to {limit_s:g} s"
+            log("info", f"Waiting for {what}, {now - start:.0f} s so far{end}. {reason}")
             next_line = now + _LINE_PERIOD_S
-        stop.wait(min(max(0.0, attempted + _ATTEMPT_S - now), began + limit - now))
+        until_next_attempt = max(0.0, attempt_start + _ATTEMPT_S - now)
+        until_limit = start + limit_s - now
+        stop.wait(min(until_next_attempt, until_limit))
     return None

@@ -2,6 +2,7 @@
 
 import collections
 import errno
+import functools
 import importlib.metadata
 import itertools
 import os
@@ -158,6 +159,22 @@ def test_each_failed_check_names_its_problem(monkeypatch, what, words, patch):
 
 def _broken():
     raise RuntimeError("no such device")
+
+
+def test_an_exception_without_text_is_a_finding():
+    def check_silence():
+        raise AssertionError
+
+    (finding,) = doctor.run_check(check_silence)
+    assert finding.what == "silence"
+    assert finding.text == "could not be checked: AssertionError"
+
+
+def test_a_missing_folder_is_a_finding_of_the_disk(tmp_path):
+    (finding,) = doctor.run_check(functools.partial(doctor.check_disk, tmp_path / "absent"))
+    assert finding.what == "disk"
+    assert not finding.fine
+    assert "absent cannot be written" in finding.text
 
 
 def test_an_old_driver_names_the_required_one(monkeypatch):
