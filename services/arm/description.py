@@ -17,8 +17,9 @@ from congrasp.services.assets.hands.robot_texts import robot_text
 from congrasp.services.assets.hands.urdf import parse_urdf
 
 SPEED = 3.14
-"""Default speed limit of joints, rad/s (m/s of slides); MJCF files never have one."""
-_SITES = ("attachment_site", "flange", "tool0", "ee_site")
+"""Default speed limit of joints, rad/s (m/s of slides); MJCF has no speed limits."""
+_FLANGE_SITES = ("attachment_site", "flange", "tool0", "ee_site")
+"""Usual names of the site of a flange."""
 _ARRAYS_FILE = "arm.npz"
 _BODIES_FILE = "arm.xml"
 _JOINT_TYPES = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
@@ -37,9 +38,9 @@ class Arm:
     lower: np.ndarray
     """(N,) rad or m; -inf where a joint has no limits."""
     upper: np.ndarray
-    """(N,) rad or m."""
+    """(N,) rad or m; inf where a joint has no limits."""
     speed: np.ndarray
-    """(N,) rad/s or m/s."""
+    """(N,) speed limits, rad/s or m/s."""
     flange: str
     """Name of the body that carries the hand."""
     position: np.ndarray
@@ -47,11 +48,12 @@ class Arm:
     quaternion: np.ndarray
     """(4,) w x y z, orientation of the flange in that body's frame."""
     postures: np.ndarray
-    """(P, N) postures in the file's keyframes."""
+    """(P, N) postures of the file's keyframes, rad or m."""
 
 
 def arm_file(name: str) -> pathlib.Path:
-    """Returns the path itself, or the file of a robot fetched by `mujoco-menagerie`.
+    """Returns the file of an arm: a path is returned unchanged, a robot of MuJoCo Menagerie is
+    fetched by `mujoco-menagerie`.
 
     Raises:
       CongraspError: there is neither such a file nor such a robot, or it cannot be fetched.
@@ -83,7 +85,7 @@ def arm_file(name: str) -> pathlib.Path:
 
 
 def _bare_entry(names: tuple[str, ...]) -> str:
-    """Entry of a robot without scene, hand and MJX variant, if there is one."""
+    """The entry of a robot without scene, hand and MJX variant, or else the most similar one."""
     return min(
         names, key=lambda name: ("scene" in name, "mjx" in name, "nohand" not in name, len(name))
     )
@@ -101,22 +103,27 @@ def load_arm(path: pathlib.Path, flange: str = "", speed: str = "") -> Arm:
       CongraspError: the file cannot be read, has no such flange, or joints that are neither hinges
         nor slides, or the speed limits are invalid.
     """
-    with confined(write_arm, path, {"flange": flange, "speed": speed}) as (names, folder):
+    with confined(write_arm, path, {"flange": flange, "speed": speed}) as (result, folder):
         arrays = read_npz(folder / _ARRAYS_FILE, "")
         spec = mujoco.MjSpec.from_string((folder / _BODIES_FILE).read_text(encoding="utf-8"))
     name = path.parent.name if path.stem in ("robot", "scene") else path.stem
     return Arm(
         name=name,
         spec=spec,
-        joints=tuple(names["joints"]),
-        flange=names["flange"],
+        joints=tuple(result["joints"]),
+        flange=result["flange"],
         **arrays,
     )
 
 
 def write_arm(folder: pathlib.Path, path: str, flange: str, speed: str) -> dict[str, Any]:
-    """Does the work of `load_arm` in the confined process: writes the bodies as MJCF, and
-    arrays.
+    """Does the work of `load_arm` in the confined process.
+
+    Args:
+      folder: gets the bodies as MJCF, and the arrays of `Arm`.
+      path: see `load_arm`.
+      flange: see `load_arm`.
+      speed: see `load_arm`.
 
     Returns:
       Names of the `joints` and of the body with the `flange`.
@@ -160,16 +167,16 @@ def _name_elements(spec: mujoco.MjSpec) -> None:
 
 
 def _joints_to(model: mujoco.MjModel, body: int) -> list[int]:
-    """Joints from the base to a body."""
+    """Joints between the base and a body, the base's first."""
     joints: list[int] = []
-    for link in _above(model, body):
+    for link in _chain_to(model, body):
         first = int(model.body_jntadr[link])
         joints.extend(range(first, first + int(model.body_jntnum[link])))
     return joints
 
 
-def _above(model: mujoco.MjModel, body: int) -> list[int]:
-    """Bodies from the base to this one."""
+def _chain_to(model: mujoco.MjModel, body: int) -> list[int]:
+    """Bodies from the base to this one, without the world."""
     chain: list[int] = []
     while body:
         chain.insert(0, body)
@@ -202,7 +209,7 @@ def _flange(model: mujoco.MjModel, path: pathlib.Path, name: str) -> _Flange:
     sites = [model.site(i).name for i in range(model.nsite)]
     bodies = [model.body(i).name for i in range(model.nbody)]
     if not name:
-        usual_sites = [site for site in _SITES if site in sites]
+        usual_sites = [site for site in _FLANGE_SITES if site in sites]
         if not usual_sites:
             return _last_body(model)
         name = usual_sites[0]
@@ -218,34 +225,35 @@ def _flange(model: mujoco.MjModel, path: pathlib.Path, name: str) -> _Flange:
 
 
 def _last_body(model: mujoco.MjModel) -> _Flange:
-    """The end of the chain of joints, before a gripper: see `_flange`.
+    """Returns the end of the chain of joints, before a gripper.
 
-    A gripper is a body without a joint whose children move apart; where it begins with a joint, it
-    stays.
+    A gripper is a body without a joint that has several children with joints. A gripper that begins
+    with a joint is taken for a part of the arm.
     """
     children: list[list[int]] = [[] for _ in range(model.nbody)]
     for child in range(1, model.nbody):
         children[int(model.body_parentid[child])].append(child)
-    moving = np.zeros(model.nbody, bool)
+    has_joints = np.zeros(model.nbody, bool)  # the body itself, or one below it
     for body in reversed(range(1, model.nbody)):
-        moving[body] |= model.body_jntnum[body] > 0
-        moving[int(model.body_parentid[body])] |= moving[body]
+        has_joints[body] |= model.body_jntnum[body] > 0
+        has_joints[int(model.body_parentid[body])] |= has_joints[body]
     body = 0
-    branches = [child for child in children[body] if moving[child]]
+    branches = [child for child in children[body] if has_joints[child]]
     while len(branches) == 1:
         body = branches[0]
-        branches = [child for child in children[body] if moving[child]]
+        branches = [child for child in children[body] if has_joints[child]]
     if len(branches) > 1 and body and not model.body_jntnum[body]:  # a gripper
         parent = int(model.body_parentid[body])
         return _Flange(parent, model.body_pos[body], model.body_quat[body])
-    while len(children[body]) == 1 and not moving[children[body][0]]:
+    # Plates that are fixed to the last link one after the other belong to the arm.
+    while len(children[body]) == 1 and not has_joints[children[body][0]]:
         body = children[body][0]
     return _frame_of(body)
 
 
 def _strip(spec: mujoco.MjSpec, model: mujoco.MjModel, flange: int) -> None:
-    """Removes all movable parts beyond the flange and everything but kinematics; no file is needed
-    afterwards.
+    """Removes all movable parts beyond the flange, and everything but bodies, joints and shapes;
+    meshes are embedded, so that the arm's files are not needed afterwards.
     """
     groups = (spec.keys, spec.actuators, spec.equalities, spec.tendons, spec.excludes, spec.pairs)
     for group in (*groups, spec.skins, spec.flexes, spec.textures, spec.plugins):
@@ -263,7 +271,9 @@ def _strip(spec: mujoco.MjSpec, model: mujoco.MjModel, flange: int) -> None:
 
 
 def _embed(mesh: mujoco.MjsMesh, model: mujoco.MjModel, index: int) -> None:
-    """Replaces a mesh's file by its vertices and faces in the model."""
+    """Replaces a mesh's file by its vertices and faces. In the model they are in the mesh's frame
+    of inertia, from which they are moved back.
+    """
     turn = Rotation.from_quat(model.mesh_quat[index], scalar_first=True)
     first_vertex = model.mesh_vertadr[index]
     end_vertex = first_vertex + model.mesh_vertnum[index]
@@ -282,18 +292,25 @@ def _embed(mesh: mujoco.MjsMesh, model: mujoco.MjModel, index: int) -> None:
 
 def _delete_moving_bodies(spec: mujoco.MjSpec, model: mujoco.MjModel, flange: int) -> None:
     """Deletes the children of the flange that move or carry a moving body."""
-    moving: set[int] = set()
+    with_joints: set[int] = set()
     for body in range(flange + 1, model.nbody):
         if model.body_jntnum[body]:
-            moving.update(_above(model, body))
-    for body in sorted(moving):
+            with_joints.update(_chain_to(model, body))
+    for body in sorted(with_joints):
         if int(model.body_parentid[body]) == flange:
             spec.delete(spec.body(model.body(body).name))
 
 
 def _speeds(path: pathlib.Path, joints: tuple[str, ...], text: str) -> np.ndarray:
-    """(N,) speed limits: those in `text`, the option's; if it is empty, those of a URDF, or
-    `SPEED`.
+    """Returns the speed limits (N,) of joints, rad/s or m/s.
+
+    Args:
+      path: the arm's file.
+      joints: N names.
+      text: the option --arm-speed; if it is empty, the limits are those of a URDF, or `SPEED`.
+
+    Raises:
+      CongraspError: the option is not valid.
     """
     if text:
         limits = numbers_in(text)

@@ -12,8 +12,8 @@ from congrasp.common.runtime.physics_library import mujoco
 from congrasp.services.arm.robot import Pose, Robot
 from congrasp.services.assets.hands.link_geometry import geom_mesh
 
-_MIN_DOUBLE_AREA = 1e-12  # of triangles, m^2; smaller ones are left out
-_BALL_RADIUS = 0.02  # of the balls that stand for the links of an arm without geometry, m
+_MIN_DOUBLE_AREA = 1e-12  # twice the area of a triangle, m^2; smaller ones are left out
+_BALL_RADIUS_M = 0.02  # of the balls that stand for the links of an arm without geometry
 _BALL_COLOUR = (0.5, 0.5, 0.5)
 
 
@@ -24,7 +24,7 @@ def moved_arm(
 
     Args:
       robot: the robot.
-      q: (T, N) joints of the arm.
+      q: (T, N) joints of the arm, rad or m.
       base: pose of its base in the world.
       mount: pose of the wrist frame in the flange's.
       reserved: names that links must not have.
@@ -76,7 +76,7 @@ def _link_poses(robot: Robot, q: np.ndarray) -> tuple[np.ndarray, Rotation]:
 
 
 def _link_names(robot: Robot, reserved: Collection[str]) -> list[str]:
-    """Names of the links in a recording, none of which is reserved."""
+    """Names of the links in a recording; a reserved name gets the prefix `arm_`."""
     names = [f"{robot.arm.name}_base"]
     for body in robot.links[1:]:
         names.append(robot.model.body(body).name)
@@ -111,10 +111,10 @@ def _mesh_arrays(model: mujoco.MjModel, links: list[int]) -> dict[str, np.ndarra
 def _coloured_meshes(
     model: mujoco.MjModel, links: list[int]
 ) -> dict[tuple[int, tuple[float, ...]], Any]:
-    """One mesh in the link's frame for each index of a link and colour: balls for an arm without
-    geometry.
+    """Returns one mesh in the link's frame for each link and colour, by the link's index and the
+    colour; balls for an arm without geometry.
     """
-    parts: dict[tuple[int, tuple[float, ...]], list[trimesh.Trimesh]] = {}
+    meshes_of_key: dict[tuple[int, tuple[float, ...]], list[trimesh.Trimesh]] = {}
     for geom in _visible_geoms(model, links):
         mesh = geom_mesh(model, geom)
         if mesh is None:
@@ -122,11 +122,11 @@ def _coloured_meshes(
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
         mesh.apply_transform(_geom_pose(model, geom))
         link = links.index(model.geom_bodyid[geom])
-        parts.setdefault((link, _geom_colour(model, geom)), []).append(mesh)
-    if not parts:
+        meshes_of_key.setdefault((link, _geom_colour(model, geom)), []).append(mesh)
+    if not meshes_of_key:
         for link in range(len(links)):
-            parts[link, _BALL_COLOUR] = [trimesh.creation.icosphere(1, _BALL_RADIUS)]
-    return {key: trimesh.util.concatenate(meshes) for key, meshes in parts.items()}
+            meshes_of_key[link, _BALL_COLOUR] = [trimesh.creation.icosphere(1, _BALL_RADIUS_M)]
+    return {key: trimesh.util.concatenate(meshes) for key, meshes in meshes_of_key.items()}
 
 
 def _visible_geoms(model: mujoco.MjModel, links: list[int]) -> list[int]:

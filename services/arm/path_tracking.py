@@ -15,26 +15,26 @@ try:
 except ModuleNotFoundError as error:
     raise MissingPackageError("--arm", error.name or "mink") from None
 
-ACCELERATION = 60.0
+_MAX_ACCELERATION = 60.0
 """Limit of every joint's acceleration, rad/s^2 (m/s^2 of slides)."""
-POSITION = 0.005
+POSITION_TOLERANCE_M = 0.005
 """Tolerance of the wrist's deviation from its path, m."""
-ANGLE = float(np.radians(2.0))
+ANGLE_TOLERANCE_RAD = float(np.radians(2.0))
 """Tolerance of the wrist's orientation, rad."""
-_START_POSITION = POSITION / 5
-_START_ANGLE = ANGLE / 5
-_RANDOM_STARTS = 24
-_MAX_TRACKED = 5  # distinct starts that are followed
+_START_POSITION_TOLERANCE_M = POSITION_TOLERANCE_M / 5
+_START_ANGLE_TOLERANCE_RAD = ANGLE_TOLERANCE_RAD / 5
+_RANDOM_SEEDS = 24  # random postures from which starts are sought
+_MAX_STARTS = 5  # distinct starts that are followed
 _SMOOTHING_S = 0.02  # standard deviation of the filter that removes contact tremor from the path
 _MAX_ITERATIONS = 80  # of the inverse kinematics, from each start
 _SETTLED_ITERATIONS = 3  # of small steps, after which the inverse kinematics has converged
-_SETTLED_STEP = 1e-2  # rad
-_MAX_STEP = 0.5  # rad
-_POSTURE_WEIGHT = 2e-3  # of the middle of the ranges, against 1 m
+_SETTLED_STEP_RAD = 1e-2  # largest small step of a joint
+_MAX_STEP_RAD = 0.5  # of a joint in one iteration
+_POSTURE_WEIGHT = 2e-3  # of a joint's distance (rad) from the middle, against 1 per m of the wrist
 _POSTURE_GAIN = 0.02  # share of the way to the middle in a step
-_ANGLE_WEIGHT = 0.3  # m/rad
-_DISTINCT_RAD = 0.05  # between two postures, below which they count as one
-_AT_END_RAD = 2e-3  # from the end of a range
+_ANGLE_WEIGHT_M_PER_RAD = 0.3  # of the wrist's rotation
+_DISTINCT_RAD = 0.05  # largest difference of two postures that count as one
+_AT_END_RAD = 2e-3  # distance from a limit below which a joint is at the end of its range
 _AT_SPEED = 0.99  # share of a speed limit
 _MAX_RANGE_RAD = np.pi  # to either side, of joints whose range is larger
 
@@ -50,7 +50,7 @@ class Path:
     rotation: Rotation
     """T of the wrist."""
     q: np.ndarray
-    """(T, F) rad, the fingers."""
+    """(T, F) rad, joints of the fingers."""
     object_position: np.ndarray
     """(T, 3) m."""
     object_quaternion: np.ndarray
@@ -58,7 +58,7 @@ class Path:
     table: np.ndarray
     """(T,) m, the table's height."""
     dt: float
-    """s."""
+    """Control step, s."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,15 +79,17 @@ class Track:
 
 @dataclasses.dataclass(frozen=True)
 class _Failure:
-    """Step at which the arm leaves a path, and the limit that it violates there."""
+    """Step at which the arm leaves a path."""
 
     step: int
     reason: str
+    """The limit that it violates there."""
 
 
 def follow(robot: Robot, path: Path, rng: np.random.Generator) -> Track:
-    """Computes the joints along a path, from the first start that reaches its end; those far from
-    joint limits first.
+    """Computes the joints along a path.
+
+    Several starts are tried, those far from joint limits first, until one reaches the path's end.
 
     Args:
       robot: arm, hand and scene.
@@ -95,7 +97,8 @@ def follow(robot: Robot, path: Path, rng: np.random.Generator) -> Track:
       rng: generator of the initial postures.
 
     Raises:
-      Infeasible: no start leads to the path's end.
+      Infeasible: no start leads to the path's end; the message names the limit that the start with
+        the longest way violates.
     """
     solver = _Solver(robot, path)
     failures = []
@@ -109,8 +112,9 @@ def follow(robot: Robot, path: Path, rng: np.random.Generator) -> Track:
 
 
 def _smooth(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Path of the wrist (T, 3) and (T, 4) without contact tremor."""
+    """Positions (T, 3) and quaternions (T, 4) of the wrist without contact tremor."""
     quaternion = path.rotation.as_quat(scalar_first=True)
+    # q and -q are one rotation: the filter needs neighbours with the same sign.
     same_sign = np.sum(quaternion[1:] * quaternion[:-1], -1) >= 0
     quaternion[1:] *= np.cumprod(np.where(same_sign, 1.0, -1.0))[:, None]
     sigma = _SMOOTHING_S / path.dt
@@ -120,7 +124,10 @@ def _smooth(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 class _Solver:
-    """mink's tasks and limits for one robot and path."""
+    """mink's tasks and limits for one robot and path.
+
+    The model's positions and velocities (Q,) are those of the arm's N joints and the hand's F.
+    """
 
     def __init__(self, robot: Robot, path: Path):
         self.robot = robot
@@ -133,7 +140,7 @@ class _Solver:
             robot.palm,
             "body",
             position_cost=1.0,
-            orientation_cost=_ANGLE_WEIGHT,
+            orientation_cost=_ANGLE_WEIGHT_M_PER_RAD,
             lm_damping=1e-6,
         )
         self.posture = self._middle_posture()
@@ -146,7 +153,7 @@ class _Solver:
         self.finger_range = _finger_range(robot)
 
     def _middle_posture(self) -> mink.PostureTask:
-        """Pulls the arm towards the middle of its ranges."""
+        """Returns a task that pulls the arm towards the middle of its ranges."""
         model = self.robot.model
         cost = np.zeros(model.nv)
         cost[self.robot.joints] = _POSTURE_WEIGHT
@@ -184,37 +191,53 @@ class _Solver:
         Raises:
           Infeasible: there is no such posture.
         """
-        random = rng.uniform(self.lower, self.upper, (_RANDOM_STARTS, len(self.lower)))
+        random = rng.uniform(self.lower, self.upper, (_RANDOM_SEEDS, len(self.lower)))
         middle = (self.lower + self.upper)[None] / 2
         seeds = np.concatenate([self.robot.arm.postures, middle, random])
         starts: list[np.ndarray] = []
         failures: list[tuple[float, str]] = []
         for seed in np.clip(seeds, self.lower, self.upper):
             q = self._solve(seed)
-            distance, angle = self._start_errors()
-            if distance > _START_POSITION or angle > _START_ANGLE:
-                reason = self._joint_at_end(q) or "the reach"
-                failures.append((distance + _ANGLE_WEIGHT * angle, reason))
-                continue
-            collision = self._collision(q, 0)
-            if collision:
-                failures.append((0.0, collision))
+            failure = self._start_failure(q)
+            if failure is not None:
+                failures.append(failure)
                 continue
             if any(np.abs(q - start).max() <= _DISTINCT_RAD for start in starts):
                 continue
             starts.append(q)
-            if len(starts) == _MAX_TRACKED:
+            if len(starts) == _MAX_STARTS:
                 break
         if not starts:
             _, reason = min(failures)
             raise Infeasible(reason)
         return sorted(starts, key=self._distance_from_limits, reverse=True)
 
+    def _start_failure(self, q: np.ndarray) -> tuple[float, str] | None:
+        """Returns why the path cannot start at the posture in the configuration; None if it can.
+
+        Args:
+          q: (N,) arm joints of this posture.
+
+        Returns:
+          The wrist's deviation, m, with that of its orientation by its weight, or 0 for a
+          collision; and the violated limit.
+        """
+        distance, angle = self._start_errors()
+        if distance > _START_POSITION_TOLERANCE_M or angle > _START_ANGLE_TOLERANCE_RAD:
+            reason = self._joint_at_end(q) or "the reach"
+            return distance + _ANGLE_WEIGHT_M_PER_RAD * angle, reason
+        collision = self._collision(q, 0)
+        if collision:
+            return 0.0, collision
+        return None
+
     def _solve(self, seed: np.ndarray) -> np.ndarray:
-        """Moves from a posture to the path's first pose; returns the arm joints (N,)."""
+        """Moves the configuration from a posture (N,) to the path's first pose, as far as it can;
+        returns the arm joints (N,).
+        """
         self.configuration.update(self.model_positions(seed, 0))
         self.aim(0)
-        settled = 0
+        small_steps = 0
         for _ in range(_MAX_ITERATIONS):
             step = mink.solve_ik(
                 self.configuration,
@@ -224,10 +247,10 @@ class _Solver:
                 damping=1e-9,
                 limits=[self.range],
             )
-            self.configuration.integrate_inplace(np.clip(step, -_MAX_STEP, _MAX_STEP), 1.0)
-            is_small = np.abs(step).max() < _SETTLED_STEP
-            settled = settled + 1 if is_small else 0
-            if settled > _SETTLED_ITERATIONS:
+            self.configuration.integrate_inplace(np.clip(step, -_MAX_STEP_RAD, _MAX_STEP_RAD), 1.0)
+            is_small = np.abs(step).max() < _SETTLED_STEP_RAD
+            small_steps = small_steps + 1 if is_small else 0
+            if small_steps > _SETTLED_ITERATIONS:
                 break
         return self.configuration.q[self.robot.joints].copy()
 
@@ -248,28 +271,28 @@ class _Solver:
         q = np.zeros((len(path.position), len(start)))
         q[0] = start
         self.configuration.update(self.model_positions(start, 0))
-        worst = np.array(self.errors(path.position[0], path.rotation[0]))
+        largest_errors = np.array(self.errors(path.position[0], path.rotation[0]))
         for t in range(1, len(q)):
             velocity = self._velocity(t)
             q[t] = q[t - 1] + path.dt * velocity[self.robot.joints]
             self.configuration.update(self.model_positions(q[t], t))
             distance, angle = self.errors(path.position[t], path.rotation[t])
-            if distance > POSITION or angle > ANGLE:
-                reason = self._joint_at_end(q[t]) or self._joint_at_speed(velocity) or self._lag(t)
-                return _Failure(t, reason)
+            if distance > POSITION_TOLERANCE_M or angle > ANGLE_TOLERANCE_RAD:
+                joint = self._joint_at_end(q[t]) or self._joint_at_speed(velocity)
+                return _Failure(t, joint or self._limit_of_path(t))
             collision = self._collision(q[t], t)
             if collision:
                 return _Failure(t, collision)
-            worst = np.maximum(worst, (distance, angle))
+            largest_errors = np.maximum(largest_errors, (distance, angle))
         speed = np.diff(q, axis=0) / path.dt
         acceleration = np.abs(np.diff(speed, axis=0)).max(0) / path.dt
-        if (acceleration > ACCELERATION).any():
+        if (acceleration > _MAX_ACCELERATION).any():
             joint = self.robot.arm.joints[int(acceleration.argmax())]
             return _Failure(len(q), f"the acceleration of {joint}")
         return Track(
             q=q,
-            position_error=float(worst[0]),
-            rotation_error=float(worst[1]),
+            position_error=float(largest_errors[0]),
+            rotation_error=float(largest_errors[1]),
             speed=np.abs(speed).max(0) / self.robot.arm.speed,
             acceleration=acceleration,
         )
@@ -291,22 +314,28 @@ class _Solver:
         arm = self.robot.arm
         distance = np.minimum(q - arm.lower, arm.upper - q)
         joint = int(distance.argmin())
-        return f"the range of {arm.joints[joint]}" if distance[joint] < _AT_END_RAD else ""
+        if distance[joint] >= _AT_END_RAD:
+            return ""
+        return f"the range of {arm.joints[joint]}"
 
     def _joint_at_speed(self, velocity: np.ndarray) -> str:
         """Describes the joint at its speed limit; empty if there is none."""
         arm = self.robot.arm
         shares = np.abs(velocity[self.robot.joints]) / arm.speed
         joint = int(shares.argmax())
-        return f"the speed of {arm.joints[joint]}" if shares[joint] > _AT_SPEED else ""
+        if shares[joint] <= _AT_SPEED:
+            return ""
+        return f"the speed of {arm.joints[joint]}"
 
-    def _lag(self, t: int) -> str:
-        """Violated limit: the path's acceleration if the arm is on the smooth path, else the
-        reach.
+    def _limit_of_path(self, t: int) -> str:
+        """Limit that a wrist away from its path violates, if no joint is at a limit: the wrist's
+        acceleration if it is on the smooth path, else the reach.
         """
         wrist = self.configuration.data.xpos[self.body]
         distance = np.linalg.norm(wrist - self.target_position[t])
-        return "the acceleration of the wrist" if distance < POSITION / 2 else "the reach"
+        if distance < POSITION_TOLERANCE_M / 2:
+            return "the acceleration of the wrist"
+        return "the reach"
 
     def _collision(self, q: np.ndarray, t: int) -> str:
         """Describes the collision at step t; empty if there is none."""

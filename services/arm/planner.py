@@ -20,7 +20,7 @@ from congrasp.services.arm.path_tracking import Path, Track, follow
 from congrasp.services.arm.robot import Pose, Robot, build_robot, default_mount
 from congrasp.services.export.frames import NOT_LINKS
 
-_REMOVED_TABLE_M = -10.0  # height of a table that was removed
+_REMOVED_TABLE_M = -10.0  # height of a removed table in the frame of the base, out of reach
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class ArmMotion:
     track: Track
 
     def facts(self) -> dict[str, Any]:
-        """Arm, base, errors and shares of the limits, for `result.json`."""
+        """Returns arm, base (m and degrees), errors and shares of the limits, for `result.json`."""
         yaw = float(self.base.rotation.as_euler("xyz", degrees=True)[2])
         base = [*self.base.position.tolist(), yaw]
         fastest = int(self.track.speed.argmax())
@@ -86,6 +86,7 @@ class ArmPlanner:
             hashlib.sha256(file.read_bytes()).hexdigest(),
             dataclasses.astuple(options),
         )
+        """Content of the file and options; equal for planners with the same results."""
 
     @property
     def name(self) -> str:
@@ -94,19 +95,19 @@ class ArmPlanner:
 
     @property
     def side(self) -> float:
-        """Side of the object on which the base is, rad from the x axis of the world frame."""
+        """Direction from the object to the base, rad from the x axis of the world frame."""
         return float(np.arctan2(self._base.position[1], self._base.position[0]))
 
     def require_reach(self, obj: GraspObject) -> None:
-        """Refuses a base from which the stretched arm cannot touch the object on the table.
-
-        Raises:
-          CongraspError: the object is farther away than arm and hand are long.
+        """Raises a CongraspError if the object on the table is farther away from the base than arm
+        and hand are long.
         """
         reach = self._robot_with(obj).reach
         radius = float(np.linalg.norm(obj.points, axis=1).max())
         distance = float(np.linalg.norm(self._base.position))
-        nearest = distance - 2.0 * radius  # the object's origin is at most its radius high
+        # The nearest point is at most a radius from the object's origin, which is at most a radius
+        # above the table.
+        nearest = distance - 2.0 * radius
         if nearest > reach:
             raise CongraspError(
                 f"{self.name}'s base is {distance:.2f} m away from '{obj.name}', and arm and hand "

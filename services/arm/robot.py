@@ -21,6 +21,7 @@ _SCENE = {_TABLE: "the table", _OBJECT: "the object"}
 _ARM_BIT = 1
 _SCENE_BIT = 2
 _HAND_BIT = 4
+"""Bits of `contype` and `conaffinity`: the arm collides with itself, the scene and the hand."""
 _NEIGHBOUR_JOINTS = 3  # bodies that are fewer joints apart may overlap: their housings do
 _TABLE_JOINTS = 2  # bodies that are fewer joints from the base may overlap the table under it
 _MIN_MASS = 1e-3  # kg
@@ -61,7 +62,7 @@ class Robot:
         quaternion: np.ndarray,
         height: float,
     ) -> None:
-        """Moves everything in `data`.
+        """Moves joints, object and table in `data`, and computes the poses of all bodies.
 
         Args:
           data: data of the model.
@@ -80,7 +81,7 @@ class Robot:
         mujoco.mj_kinematics(self.model, data)
 
     def collision(self, data: mujoco.MjData) -> str:
-        """Describes the pair of overlapping bodies; empty if there is none."""
+        """Describes a pair of overlapping bodies, after `place`; empty if there is none."""
         mujoco.mj_collision(self.model, data)
         overlaps = np.flatnonzero(data.contact.dist < 0.0)
         if not len(overlaps):
@@ -188,7 +189,7 @@ def _depths(spec: mujoco.MjSpec, arm: Arm) -> dict[str, int]:
 
 
 def _set_arm_collisions(spec: mujoco.MjSpec) -> None:
-    """Makes the arm's collision geoms collide with everything: all geoms if it has none."""
+    """Makes the arm's collision geoms collide with everything; if it has none, all of its geoms."""
     has_collision_geoms = any(geom.contype | geom.conaffinity for geom in spec.geoms)
     for geom in spec.geoms:
         if geom.contype | geom.conaffinity or not has_collision_geoms:
@@ -207,9 +208,9 @@ def _attach_hand(spec: mujoco.MjSpec, arm: Arm, hand: Hand, mount: Pose) -> None
 
 
 def _hand_spec(hand: Hand) -> mujoco.MjSpec:
-    """Returns only the hand's bodies and finger joints."""
+    """Returns the hand's bodies and finger joints, without anything else."""
     spec = mujoco.MjSpec()
-    spec.compiler.degree = False  # whatever the arm's is
+    spec.compiler.degree = False  # the arm may have another unit of angles
     add_hand(spec, hand)
     for group in (spec.actuators, spec.equalities, spec.tendons, spec.excludes):
         for element in list(group):

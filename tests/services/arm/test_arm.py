@@ -23,7 +23,12 @@ from congrasp.common.errors import CongraspError, MissingPackageError
 from congrasp.common.hands import get_hand
 from congrasp.services.arm import ArmOptions
 from congrasp.services.arm.description import SPEED, arm_file, load_arm
-from congrasp.services.arm.path_tracking import ANGLE, POSITION, Path, follow
+from congrasp.services.arm.path_tracking import (
+    ANGLE_TOLERANCE_RAD,
+    POSITION_TOLERANCE_M,
+    Path,
+    follow,
+)
 from congrasp.services.arm.planner import ArmPlanner
 from congrasp.services.arm.robot import Infeasible, build_robot, default_mount
 from congrasp.services.assets.objects.named import one_object
@@ -129,9 +134,9 @@ def test_poses_of_forward_kinematics_come_back_within_every_limit(robot):
     off = np.linalg.norm(again.position - path.position, axis=-1)
     turned = (again.rotation.inv() * path.rotation).magnitude()
     assert off.max() == pytest.approx(track.position_error, abs=1e-9)
-    assert off.max() < 2e-3 < POSITION
+    assert off.max() < 2e-3 < POSITION_TOLERANCE_M
     assert turned.max() == pytest.approx(track.rotation_error, abs=1e-6)
-    assert turned.max() < np.radians(0.5) < ANGLE
+    assert turned.max() < np.radians(0.5) < ANGLE_TOLERANCE_RAD
     assert (track.q >= robot.arm.lower).all()
     assert (track.q <= robot.arm.upper).all()
     speed = np.abs(np.diff(track.q, axis=0)) / path.dt
@@ -347,7 +352,7 @@ def test_result_of_a_grasp_on_the_arm(arm_grasp):
     assert facts["arm_base"] == [-0.6, 0, 0, 0]
     assert facts["success"]
     assert "seven carries the hand within" in printed
-    assert 0 < facts["arm_error_mm"] < 1e3 * POSITION
+    assert 0 < facts["arm_error_mm"] < 1e3 * POSITION_TOLERANCE_M
     assert 0 < facts["arm_speed_share"] <= 1 + 1e-6
 
 
