@@ -22,9 +22,10 @@ WRIST_DOF = 6
 """Number of the virtual wrist joints: translations, then rotations."""
 _REQUIRED = ("surface", "q", "wrist", "object_pose")
 _REQUIRED_WITH_CAMERA = ("cloud", "q", "wrist")
-_MAX_SPREAD = 1.0  # m, median deviation of points
-_MAX_ANGLE = 2 * math.pi  # rad
-_ANGLES = re.compile(r"(?:\w+_)?q(?:_initial|_target)?|u")  # of u, the last three
+_MAX_SPREAD_M = 1.0  # median deviation of points from their median
+_MAX_ANGLE_RAD = 2 * math.pi
+_ANGLES = re.compile(r"(?:\w+_)?q(?:_initial|_target)?|u")
+"""Names of fields with angles; those of `u` are its last three numbers."""
 
 
 def require(names: Sequence[str], fields: Mapping[str, Any]) -> None:
@@ -54,7 +55,7 @@ def checked(values: Mapping[str, Any]) -> dict[str, np.ndarray]:
       RefusedError: a field is not a numeric array, or is in mm, cm or degrees.
     """
     fields = {name: as_numbers(name, value) for name, value in values.items()}
-    # Numbers that are not finite are refused by the first `act`
+    # The policy itself refuses numbers that are not finite.
     with np.errstate(invalid="ignore"):
         for name in ("surface_points", "cloud"):
             _check_metres(name, fields.get(name))
@@ -68,7 +69,7 @@ def _check_metres(name: str, points: np.ndarray | None) -> None:
     if points is None or points.ndim != 2 or not points.size:
         return
     spread = np.median(np.abs(points - np.median(points, 0)))
-    if spread > _MAX_SPREAD:
+    if spread > _MAX_SPREAD_M:
         raise RefusedError(
             f"The median extent of the field '{name}' would be {spread:.3g} m.",
             "Give it in metres.",
@@ -83,14 +84,14 @@ def _check_radians(name: str, field: np.ndarray) -> None:
     if name == "u":
         angles = angles[3:]
     largest = np.abs(angles).max(initial=0.0)
-    if _MAX_ANGLE < largest < math.inf:
+    if _MAX_ANGLE_RAD < largest < math.inf:
         raise RefusedError(
             f"The field '{name}' has an angle of {largest:.4g}.", "Give it in radians."
         )
 
 
 def episode_fields(request: GraspRequest) -> dict[str, np.ndarray]:
-    """The constant fields of an episode's queries, and the first targets.
+    """Returns the constant fields of an episode's queries, and the first targets.
 
     Raises:
       RefusedError: the request lacks a required field, or a field is not a numeric array.
@@ -127,7 +128,8 @@ def episode_fields(request: GraspRequest) -> dict[str, np.ndarray]:
 
 
 def position_and_quaternion(name: str, pose: Pose | None) -> tuple[Any, Any]:
-    """Position and quaternion of a pose; None for both without one.
+    """Returns position and quaternion of the pose in a request's field `name`; None for both if
+    there is no pose.
 
     Raises:
       RefusedError: the pose is not a pair.

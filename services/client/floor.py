@@ -8,6 +8,9 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.request import Pose
 from congrasp.services.client.arrays import as_numbers
 
+_NORMAL_TOLERANCE = 1e-3  # of the length of a plane's normal
+_QUATERNION_TOLERANCE = 0.02  # of the length of a measured quaternion
+
 
 class Floor:
     """Clearance of the palm above a plane, as a function of the wrist joints."""
@@ -27,23 +30,23 @@ class Floor:
         plane = as_numbers(plane, 4)
         position = as_numbers(wrist[0], 3)
         quaternion = as_numbers(wrist[1], 4)
-        is_normal = abs(np.linalg.norm(plane[:3]) - 1.0) < 1e-3
-        is_rotation = abs(np.linalg.norm(quaternion) - 1.0) < 0.02
+        is_normal = abs(np.linalg.norm(plane[:3]) - 1.0) < _NORMAL_TOLERANCE
+        is_rotation = abs(np.linalg.norm(quaternion) - 1.0) < _QUATERNION_TOLERANCE
         if not is_normal or not is_rotation:
             raise CongraspError(
                 "The table's normal and the wrist's quaternion must have the length 1."
             )
         self.normal = _matrix(quaternion).T @ plane[:3]
         """(3,) normal of the plane in the frame of the base."""
-        self._offset = plane[3] - plane[:3] @ position
+        self._offset = plane[3] - plane[:3] @ position  # of the plane along the normal, m
         self._palm = palm
         if not math.isfinite(self._offset):
             raise CongraspError("The table's height and the wrist's position must be finite.")
 
     def clearance(self, u: np.ndarray) -> float:
         """Least distance, m, of the palm from the plane at wrist joints (6,); negative below it."""
-        places = u[:3] + self._palm[:, :3] @ _turned(u[3:]).T
-        return float((places @ self.normal - self._palm[:, 3]).min() - self._offset)
+        centres = u[:3] + self._palm[:, :3] @ _rotation(u[3:]).T  # in the frame of the base
+        return float((centres @ self.normal - self._palm[:, 3]).min() - self._offset)
 
 
 def _matrix(quaternion: np.ndarray) -> np.ndarray:
@@ -53,7 +56,7 @@ def _matrix(quaternion: np.ndarray) -> np.ndarray:
     return np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
 
 
-def _turned(angles: np.ndarray) -> np.ndarray:
+def _rotation(angles: np.ndarray) -> np.ndarray:
     """(3, 3) rotation by intrinsic x-y-z angles (3,)."""
     x, y, z = (_axis_rotation(axis, angle) for axis, angle in enumerate(angles))
     return x @ y @ z

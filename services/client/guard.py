@@ -25,7 +25,7 @@ from congrasp.services.client.speeds import Speeds
 
 Fallback = Literal["freeze", "open"]
 Mode = Literal["follow", "hold", "freeze", "open"]
-_LIFTED_M = 0.02  # height above its first one at which an object counts as held
+_LIFTED_M = 0.02  # rise above its first height from which an object counts as held
 _TRACKED_SIZES = {"object_position": 3, "object_quaternion": 4}
 """Measurements by a tracker and their sizes."""
 
@@ -45,7 +45,7 @@ class Counters:
     answers: int = 0
     """Accepted answers."""
     late: int = 0
-    """Steps without an answer, to their own state or an earlier one."""
+    """Steps in which no answer arrived, neither to their own state nor to an earlier one."""
     stale: int = 0
     """Answers discarded because their state was too old."""
     invalid: int = 0
@@ -95,11 +95,12 @@ class Guard(Closing):
     none, the last targets are held; after `hold` seconds without one, the fallback applies until
     the next `reset`: `freeze` keeps the targets and their torques, `open` opens the fingers as fast
     as the limits allow and keeps the wrist. `open` becomes `freeze` if the object may be held or a
-    measurement is missing; `open()` opens in any case. The policy continues from the commanded
-    targets, not from those that it requested.
+    measurement is missing; the method `open` opens in any case. The policy continues from the
+    commanded targets, not from those that it requested.
 
-    An object may be held once it was 2 cm above its first height, or `table` of a state was false,
-    until the next `reset`; a policy with a camera has no height, so that only `table` counts.
+    An object may be held, until the next `reset`, once it was 2 cm above its first height or
+    `table` of a state was false. A policy with a camera does not know the height: only `table`
+    counts.
 
     Attributes:
       counters: counters of commands and answers.
@@ -161,22 +162,22 @@ class Guard(Closing):
         self.counters = Counters()
         self.trouble = ""
         self._limits = limits
-        self._open = as_numbers(open_pose, fingers)
-        self._period = period
-        self._wait = wait
-        self._stale = stale
-        self._hold = hold
+        self._open_pose = as_numbers(open_pose, fingers)
+        self._period_s = period
+        self._wait_s = wait
+        self._stale_s = stale
+        self._hold_s = hold
         self._fallback = fallback
         self._clock = clock
         self._fingers = fingers
         self._table = np.array(table, float)
         self._sizes: dict[str, int] = {}  # of the measurements that the policy needs
-        self._limiter: Limiter | None = None
+        self._limiter: Limiter | None = None  # None before the first episode
         self._speeds = Speeds(limits.speed, stale)
         self._target = np.zeros(fingers + 6)  # requested, before the limits
-        self._fresh_time = clock()  # of the state of the last accepted answer
-        self._answer: Answer | None = None
-        self._latched: Fallback | None = None
+        self._fresh_time = clock()  # of the state of the last accepted answer, s
+        self._answer: Answer | None = None  # the last accepted one
+        self._latched_mode: Fallback | None = None  # until `reset`, `open` or `freeze`
         self._first_height = math.nan
         self._holds_object = False
         self._queries = QueryThread(policy)
@@ -203,12 +204,12 @@ class Guard(Closing):
         floor = None
         if request.wrist is not None:
             floor = Floor(self._table, request.wrist, self._limits.palm)
-        self._limiter = Limiter(self._limits, start, period=self._period, floor=floor)
-        self._speeds = Speeds(self._limits.speed, self._stale)
+        self._limiter = Limiter(self._limits, start, period=self._period_s, floor=floor)
+        self._speeds = Speeds(self._limits.speed, self._stale_s)
         self._target = self._limiter.target
         self._fresh_time = self._clock()
         self._answer = None
-        self._latched = None
+        self._latched_mode = None
         self._holds_object = False
         object_position = request.object_pose and request.object_pose[0]
         self._first_height = as_numbers(object_position, 3)[2]
@@ -221,14 +222,14 @@ class Guard(Closing):
         """Opens the fingers from the next step on, until `reset` or `freeze`, even if they hold an
         object.
         """
-        self._latched = "open"
+        self._latched_mode = "open"
 
     def freeze(self) -> None:
         """Keeps the targets and their torques from the next step on, until `reset` or `open`."""
-        self._latched = "freeze"
+        self._latched_mode = "freeze"
 
     def step(self, state: State) -> Command:
-        """The next command; returns after at most `wait` seconds, and accepts invalid states.
+        """Returns the next command, after at most `wait` seconds; accepts invalid states.
 
         Args:
           state: see `Policy.act`; missing fields count as not measured. Missing joint velocities
@@ -244,14 +245,17 @@ class Guard(Closing):
         now = self._clock()
         position, velocity = self._measured(state, now)
         query = self._query(state, velocity, self._limiter.target)
-        self._take(self._queries.exchange(query, now, self._wait))
-        mode = self._mode(state, np.append(position, velocity))
+        self._accept(self._queries.exchange(query, now, self._wait_s))
+        mode = self._next_mode(state, np.append(position, velocity))
         if mode == "open":
-            self._target = np.append(self._open, self._limiter.target[self._fingers :])
+            self._target = np.append(self._open_pose, self._limiter.target[self._fingers :])
         elif mode != "follow":
             self._target = self._limiter.target
         limited = self._limiter.limit(self._target, position, velocity, now)
         self._count(mode, limited.by)
+        followed = None
+        if mode == "follow":
+            followed = self._answer
         q_target, u_target = np.split(limited.target, [self._fingers])
         q_torque, u_torque = np.split(limited.torque, [self._fingers])
         return Command(
@@ -260,7 +264,7 @@ class Guard(Closing):
             q_torque=q_torque,
             u_torque=u_torque,
             mode=mode,
-            answer=self._answer if mode == "follow" else None,
+            answer=followed,
         )
 
     def close(self) -> None:
@@ -268,14 +272,15 @@ class Guard(Closing):
         self._queries.close()
 
     def _query(self, state: State, velocity: np.ndarray, target: np.ndarray) -> State:
-        """State of a query: with all measurements that the policy needs, NaN where one is missing,
-        with velocities, and with the commanded targets.
+        """Returns the state of a query: the given state with estimated velocities, if it has none,
+        with NaN for other missing measurements, and with the commanded targets.
         """
         q_velocity, u_velocity = np.split(velocity, [self._fingers])
         q_target, u_target = np.split(target, [self._fingers])
-        missing = {
-            name: np.full(size, np.nan) for name, size in self._sizes.items() if name not in state
-        }
+        missing = {}
+        for name, size in self._sizes.items():
+            if name not in state:
+                missing[name] = np.full(size, np.nan)
         return {
             "q_velocity": q_velocity,
             "u_velocity": u_velocity,
@@ -288,11 +293,12 @@ class Guard(Closing):
     def _count(self, mode: Mode, limits: Sequence[str]) -> None:
         """Counts a command, and the limits that changed it."""
         kind = mode if mode in ("follow", "hold") else "fallback"
+        # The counters have the names of the limits.
         for name in ("steps", kind, *limits):
             setattr(self.counters, name, getattr(self.counters, name) + 1)
 
-    def _take(self, outcome: Outcome | None) -> None:
-        """Accepts an answer if it is fresh and finite, and counts the outcome."""
+    def _accept(self, outcome: Outcome | None) -> None:
+        """Follows an answer from now on if it is fresh and finite, and counts the outcome."""
         if outcome is None:
             self.counters.late += 1
             return
@@ -311,7 +317,7 @@ class Guard(Closing):
             self.counters.invalid += 1
             return
         age = self._clock() - outcome.state_time
-        if not 0.0 <= age <= self._stale:
+        if not 0.0 <= age <= self._stale_s:
             self.counters.stale += 1
             return
         self._target = target
@@ -320,25 +326,34 @@ class Guard(Closing):
         self.trouble = ""
         self.counters.answers += 1
 
-    def _mode(self, state: State, measured: np.ndarray) -> Mode:
-        """Returns the mode of the next command; `measured` are positions and velocities."""
+    def _next_mode(self, state: State, measured: np.ndarray) -> Mode:
+        """Returns the mode of the next command.
+
+        Args:
+          state: the current state.
+          measured: its positions and velocities, NaN where they are missing.
+        """
         height = as_numbers(state.get("object_position"), 3)[2]
         is_off_table = not np.all(state.get("table", True))
         is_lifted = bool(height > self._first_height + _LIFTED_M)
         self._holds_object = self._holds_object or is_off_table or is_lifted
         age = self._clock() - self._fresh_time
-        if self._latched is None and not 0.0 <= age <= self._hold:
-            heights = (self._first_height, height) if "object_position" in self._sizes else ()
-            is_complete = np.isfinite(np.append(heights, measured)).all()
-            is_safe = is_complete and not self._holds_object
-            self._latched = self._fallback if is_safe else "freeze"
-        if self._latched is not None:
-            return self._latched
-        is_fresh = self._answer is not None and age <= self._stale
+        # Without an answer for too long, or with a clock that was set back
+        if self._latched_mode is None and not 0.0 <= age <= self._hold_s:
+            if "object_position" in self._sizes:
+                measured = np.append(measured, [self._first_height, height])
+            may_open = np.isfinite(measured).all() and not self._holds_object
+            self._latched_mode = self._fallback if may_open else "freeze"
+        if self._latched_mode is not None:
+            return self._latched_mode
+        is_fresh = self._answer is not None and age <= self._stale_s
         return "follow" if is_fresh else "hold"
 
     def _measured(self, state: State, now: float) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities (F + 6,) of a state; velocities that it lacks are estimated."""
+        """Returns positions and velocities (F + 6,) of a state, NaN where a value is invalid.
+
+        Velocities that the state lacks are estimated.
+        """
         q = as_numbers(state.get("q"), self._fingers)
         u = as_numbers(state.get("u"), 6)
         position = np.append(q, u)
@@ -351,7 +366,12 @@ class Guard(Closing):
 def _completed(
     policy: Policy, limits: JointLimits | None, open_pose: np.ndarray | None
 ) -> tuple[JointLimits, np.ndarray]:
-    """Limits and open pose, by default those of the policy's metadata."""
+    """Returns limits and open pose, by default those of the policy's metadata.
+
+    Raises:
+      CongraspError: see `Guard`.
+      TransportError: see `Guard`.
+    """
     metadata = policy.metadata()
     if limits is None:
         if metadata["limits"] is None:

@@ -34,61 +34,64 @@ class LeftPolicy(Policy):
 
     def act(self, state: State) -> Answer:
         """See `Policy.act`."""
-        return _answer(self._right.act(mirror.fields(state)))
+        return _mirrored_answer(self._right.act(mirror.fields(state)))
 
     def act_each(self, states: Sequence[State]) -> list[Answer]:
         """See `Policy.act_each`."""
         mirrored = [mirror.fields(state) for state in states]
-        return [_answer(answer) for answer in self._right.act_each(mirrored)]
+        return [_mirrored_answer(answer) for answer in self._right.act_each(mirrored)]
 
     def metadata(self) -> dict[str, Any]:
         """See `Policy.metadata`; the limits are those of the left hand."""
         metadata = self._right.metadata()
         hand = f"{metadata['hand']}:left"
-        return {**metadata, "hand": hand, "limits": _limits(metadata["limits"])}
+        return {**metadata, "hand": hand, "limits": _mirrored_limits(metadata["limits"])}
 
     def close(self) -> None:
         """See `Policy.close`."""
         self._right.close()
 
 
-def _limits(right: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """The limits of the left hand, if there are any."""
+def _mirrored_limits(right: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """Returns the limits of the left hand (`JointLimits.as_lists`), if there are any."""
     if right is None:
         return None
+    # Where the mirror changes the sign, it exchanges the lower and the upper limit.
     ends = np.array([mirror.wrist(right["lower"]), mirror.wrist(right["upper"])])
     palm = [[-x, *rest] for x, *rest in right["palm"]]
     return {**right, "lower": ends.min(0).tolist(), "upper": ends.max(0).tolist(), "palm": palm}
 
 
 def mirrored_request(request: GraspRequest) -> GraspRequest:
-    """The request for the mirror image of its object and hand."""
+    """Returns the request for the mirror image of its object and hand."""
     return dataclasses.replace(
         request,
         constraints={name: mirror.fields(arrays) for name, arrays in request.constraints.items()},
-        surface=_vectors(request.surface),
-        cloud=_vectors(request.cloud),
-        normals=_vectors(request.normals),
-        camera=_vectors(request.camera),
-        wrist=_pose("wrist", request.wrist),
-        object_pose=_pose("object_pose", request.object_pose),
+        surface=_mirrored_vectors(request.surface),
+        cloud=_mirrored_vectors(request.cloud),
+        normals=_mirrored_vectors(request.normals),
+        camera=_mirrored_vectors(request.camera),
+        wrist=_mirrored_pose("wrist", request.wrist),
+        object_pose=_mirrored_pose("object_pose", request.object_pose),
     )
 
 
-def _vectors(array: ArrayLike | None) -> np.ndarray | None:
-    """Mirrored points or directions, if there are any."""
-    return None if array is None else mirror.vector(array)
+def _mirrored_vectors(array: ArrayLike | None) -> np.ndarray | None:
+    """Returns mirrored points or directions (..., 3), if there are any."""
+    if array is None:
+        return None
+    return mirror.vector(array)
 
 
-def _answer(answer: Answer) -> Answer:
-    """The mirrored answer."""
+def _mirrored_answer(answer: Answer) -> Answer:
+    """Returns the mirrored answer; the fingers have the same angles."""
     return answer._replace(
         u_target=mirror.wrist(answer.u_target), action=mirror.wrist(answer.action)
     )
 
 
-def _pose(name: str, pose: Pose | None) -> Pose | None:
-    """A mirrored pose, if there is one."""
+def _mirrored_pose(name: str, pose: Pose | None) -> Pose | None:
+    """Returns the mirrored pose in the request's field `name`, if there is one."""
     if pose is None:
         return None
     position, quaternion = position_and_quaternion(name, pose)

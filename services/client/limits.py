@@ -18,9 +18,9 @@ class JointLimits:
     """Limits and servo gains of F finger joints, then the wrist's three slides and three hinges: J
     = F + 6.
 
-    SI units: N and m for slides, N.m and rad for hinges and fingers. For the slides, the norm of
-    speed, acceleration and torque is limited, to the least of the three limits; likewise for the
-    hinges.
+    SI units: N and m for slides, N.m and rad for hinges and fingers. The norms of the three slides'
+    speeds, accelerations and torques are limited to the least of their three limits; likewise those
+    of the hinges.
     """
 
     lower: np.ndarray
@@ -36,7 +36,7 @@ class JointLimits:
     kv: np.ndarray
     """(J,) damping of the servo."""
     acceleration: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
-    """(J,) greatest acceleration of a target; 0, the default, for no limit."""
+    """(J,) greatest acceleration of a target; 0 for no limit, which is the default."""
     palm: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((1, 4)))
     """(K, 4) m: centres in the wrist frame and radii of spheres that must stay above the table
     (`Guard`).
@@ -84,8 +84,8 @@ class JointLimits:
         margin: float = 0.03,
         grip: float = math.inf,
     ) -> Self:
-        """Limits of the fingers' motors, then of the six wrist joints, with gains and torques of
-        the hand's model.
+        """Returns the limits of the fingers' motors, then of the six wrist joints, with gains and
+        torques of the hand's model.
 
         The wrist's targets have the task's acceleration limits (`ControlConfig`); its force and
         torque are limited to those that accelerate the hand's inertia as much. Most hands have a
@@ -112,8 +112,9 @@ class JointLimits:
         wrist = hand.wrist
         motors = hand.motors
         accelerations = np.array([control.wrist_acceleration, control.wrist_angular_acceleration])
-        strongest = np.where(accelerations > 0.0, accelerations * hand.wrist_inertia, np.inf)
-        wrist_torques = np.minimum(strongest, [wrist.slide_limit, wrist.hinge_limit])
+        # Force and torque that accelerate the hand to the limit of acceleration
+        accelerating = np.where(accelerations > 0.0, accelerations * hand.wrist_inertia, np.inf)
+        wrist_torques = np.minimum(accelerating, [wrist.slide_limit, wrist.hinge_limit])
         levers = _levers(hand)
         finger_torques = []
         for motor in motors:
@@ -142,15 +143,15 @@ class JointLimits:
         )
 
     def as_lists(self) -> dict[str, Any]:
-        """The fields as lists, for JSON; `JointLimits(**fields)` is the inverse."""
+        """Returns the fields as lists, for JSON; `JointLimits(**fields)` is the inverse."""
         return {
             field.name: getattr(self, field.name).tolist() for field in dataclasses.fields(self)
         }
 
 
 def _levers(hand: "Hand") -> dict[str, float]:
-    """Distances, m, from joints by name to the farthest fingertip that they move, with every joint
-    at zero.
+    """Returns the distance, m, from each joint, by its name, to the farthest fingertip that it
+    moves, with every joint at zero.
     """
     links = {link.name: link for link in hand.links}
     levers: dict[str, float] = {}

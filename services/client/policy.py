@@ -60,7 +60,7 @@ class Policy(Closing, Protocol):
         ...
 
     def act(self, state: State) -> Answer:
-        """Joint targets for the current state.
+        """Returns joint targets for the current state.
 
         Args:
           state: `q`, `u`, `object_position`, `object_quaternion`; optionally `table` (True by
@@ -80,8 +80,8 @@ class Policy(Closing, Protocol):
         ...
 
     def act_each(self, states: Sequence[State]) -> list[Answer]:
-        """Joint targets for each of several states, as `act` would return them now; the episode
-        does not advance.
+        """Returns joint targets for each of several states, as `act` would return them now; the
+        episode does not advance.
 
         For planners that compare candidates: one query for all of them is much cheaper than one for
         each.

@@ -13,7 +13,7 @@ from congrasp.common.transport.keys import Keys
 from congrasp.common.wire.codec import Message
 from congrasp.services.client.episode_policy import EpisodePolicy
 
-_AGAIN = 0.2  # seconds between two queries of a server that does not respond
+_RETRY_PAUSE_S = 0.2  # between two queries of a server that does not respond or is starting
 
 
 class PolicyClient(EpisodePolicy):
@@ -47,28 +47,30 @@ class PolicyClient(EpisodePolicy):
         self._transport = urls.connect(connect, "client", certs=certs, wait=wait)
         self._keys = Keys(run)
         self._hand = hand
-        self._timeout = timeout
-        self._wait = wait
-        self._is_known = False  # the server has answered
+        self._timeout_s = timeout
+        self._wait_s = wait
+        self._has_metadata = False  # True once the server has sent its metadata
         self._act_key = self._keys.act_for(urls.name_on_wire(secrets.token_hex(4), certs, "client"))
 
     def health(self) -> dict[str, object]:
-        """Readiness, version, hand and queue of the server, or how long it has been compiling."""
+        """Returns readiness, version, hand and queue of the server, or for how long it has been
+        compiling.
+        """
         return dict(
-            self._transport.query(self._keys.health, Message({}, {}), timeout=self._timeout).meta
+            self._transport.query(self._keys.health, Message({}, {}), timeout=self._timeout_s).meta
         )
 
     def wait_until_ready(self) -> dict[str, Any]:
-        """Health of the server; waits for one that is starting.
+        """Returns the health of the server; waits for one that is starting.
 
         Raises:
           StartingError: it is still starting after the seconds to wait.
           TransportError: there is no response.
         """
-        return self._patiently(self._ready_health)
+        return self._once_started(self._ready_health)
 
     def _ready_health(self) -> dict[str, Any]:
-        """The health of a server that answers queries."""
+        """Returns the health of the server; raises a StartingError if it is not ready."""
         health = self.health()
         if not health["ready"]:
             raise StartingError(f"The policy server is {health['state']}.", "Wait for it.")
@@ -77,28 +79,38 @@ class PolicyClient(EpisodePolicy):
     def metadata(self) -> dict[str, Any]:
         """See `Policy.metadata`; waits for a server that is starting."""
         forks.require_same_process(self._fork_generation, "policy")
-        return self._patiently(self._query_metadata)
+        return self._once_started(self._query_metadata)
 
     def _fetch_metadata(self) -> dict[str, Any]:
-        """The metadata; only the first call waits, since later ones are part of a control loop."""
-        return self._query_metadata() if self._is_known else self.metadata()
+        """Returns the metadata; only the first call waits, since later ones are part of a control
+        loop.
+        """
+        if self._has_metadata:
+            return self._query_metadata()
+        return self.metadata()
 
-    def _patiently(self, ask: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    def _once_started(self, ask: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """Repeats a query until a server that is starting answers it, for the seconds to wait."""
-        deadline = time.monotonic() + self._wait
+        deadline = time.monotonic() + self._wait_s
         while True:
             try:
                 return ask()
             except TransportError as error:
+                # A StartingError is a RefusedError that will pass.
                 is_final = isinstance(error, RefusedError) and not isinstance(error, StartingError)
                 if is_final or time.monotonic() > deadline:
                     raise
-                time.sleep(_AGAIN)
+                time.sleep(_RETRY_PAUSE_S)
 
     def _query_metadata(self) -> dict[str, Any]:
-        """The metadata of a server that responds."""
+        """Returns the metadata of the server.
+
+        Raises:
+          RefusedError: the server is older than this client, or serves another hand.
+          TransportError: there is no response.
+        """
         query = Message({}, {"metadata": True})
-        reply = self._transport.query(self._keys.health, query, timeout=self._timeout)
+        reply = self._transport.query(self._keys.health, query, timeout=self._timeout_s)
         metadata = dict(reply.meta)
         if "query" not in metadata:
             raise RefusedError(
@@ -110,7 +122,7 @@ class PolicyClient(EpisodePolicy):
                 f"The policy is for the hand {ascii(metadata['hand'])[:60]}, not '{self._hand}'.",
                 "Connect to a server of this hand, or pass another hand.",
             )
-        self._is_known = True
+        self._has_metadata = True
         return metadata
 
     def close(self) -> None:
@@ -118,6 +130,6 @@ class PolicyClient(EpisodePolicy):
         self._transport.close()
 
     def _query(self, query: Message) -> Message:
-        """The server's reply."""
-        query = Message(query.arrays, {"timeout": self._timeout, **query.meta})
-        return self._transport.query(self._act_key, query, timeout=self._timeout)
+        """Returns the server's reply."""
+        query = Message(query.arrays, {"timeout": self._timeout_s, **query.meta})
+        return self._transport.query(self._act_key, query, timeout=self._timeout_s)

@@ -8,7 +8,7 @@ from congrasp.common.request import GraspRequest
 from congrasp.common.runtime import forks
 from congrasp.services.client.policy import Answer, Policy, State
 
-_END_S = 2.0  # deadline for the end of the thread, s
+_END_TIMEOUT_S = 2.0  # deadline for the end of the thread
 
 
 class Outcome(NamedTuple):
@@ -19,11 +19,12 @@ class Outcome(NamedTuple):
     """Time of the state of the query, s."""
 
 
-class _Question(NamedTuple):
+class _PendingQuery(NamedTuple):
     """A state that waits for the thread."""
 
     state: State
     time: float
+    """Time of the state, s."""
 
 
 class QueryThread:
@@ -32,54 +33,54 @@ class QueryThread:
     def __init__(self, policy: Policy):
         self._policy = policy
         self._fork_generation = forks.generation()
-        self._changed = threading.Condition()
-        self._request: GraspRequest | None = None
-        self._question: _Question | None = None
-        self._outcome: Outcome | None = None
-        self._episode = 0
-        self._busy = False
-        self._closed = False
+        self._changed = threading.Condition()  # guards the following
+        self._request: GraspRequest | None = None  # of the current episode
+        self._pending: _PendingQuery | None = None
+        self._outcome: Outcome | None = None  # until `exchange` returns it
+        self._episode = 0  # number of the current episode
+        self._is_busy = False  # a query is pending, or the policy is answering it
+        self._is_closed = False
         self._thread = threading.Thread(target=self._work, daemon=True, name="guard")
         self._thread.start()
 
     @property
     def is_busy(self) -> bool:
-        """True while a query is pending."""
+        """True while a query is pending or being answered."""
         with self._changed:
-            return self._busy
+            return self._is_busy
 
     def require_same_process(self) -> None:
         """Raises a ForkError in a fork of this process, where the thread does not run."""
         forks.require_same_process(self._fork_generation, "guard")
 
     def begin(self, request: GraspRequest) -> None:
-        """Begins an episode."""
+        """Begins an episode; a pending query is dropped."""
         with self._changed:
             self._episode += 1
-            self._busy = self._busy and self._question is None
+            if self._pending is not None:  # else the policy may still be answering a query
+                self._is_busy = False
             self._request = request
-            self._question = None
+            self._pending = None
             self._outcome = None
 
     def exchange(self, state: State, now: float, timeout: float) -> Outcome | None:
-        """Queries with a state, unless a query is pending, and returns the newest outcome within
-        the timeout.
+        """Queries with a state unless the thread is busy, and waits for an outcome.
 
         Args:
           state: the state.
-          now: time of the state.
+          now: time of the state, s.
           timeout: seconds to wait.
 
         Returns:
-          An outcome that was not returned before, of this state or of an earlier one; None without
-          one.
+          The newest outcome that was not returned before, of this state or of an earlier one; None
+          if there is none.
         """
         with self._changed:
             earlier = self._outcome
             self._outcome = None
-            if not self._busy:
-                self._question = _Question(state, now)
-                self._busy = True
+            if not self._is_busy:
+                self._pending = _PendingQuery(state, now)
+                self._is_busy = True
                 self._changed.notify_all()
             self._changed.wait_for(lambda: self._outcome is not None, timeout)
             outcome = self._outcome or earlier
@@ -87,15 +88,15 @@ class QueryThread:
             return outcome
 
     def close(self) -> None:
-        """Ends the thread, unless a query blocks it, and closes the policy; a fork leaves both to
-        the process that opened them.
+        """Ends the thread, unless a query blocks it, and closes the policy. In a fork it does
+        neither: both belong to the process that opened them.
         """
         if self._fork_generation != forks.generation():
             return
         with self._changed:
-            self._closed = True
+            self._is_closed = True
             self._changed.notify_all()
-        self._thread.join(_END_S)
+        self._thread.join(_END_TIMEOUT_S)
         self._policy.close()
 
     def _work(self) -> None:
@@ -103,25 +104,26 @@ class QueryThread:
         answered_episode = 0  # the last episode with an answer
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._question is not None or self._closed)
-                if self._closed or self._question is None:
+                self._changed.wait_for(lambda: self._pending is not None or self._is_closed)
+                if self._is_closed or self._pending is None:
                     return
-                question = self._question
+                query = self._pending
                 episode = self._episode
                 request = self._request
-                self._question = None
-            is_first = episode != answered_episode
-            answer = self._answer(request if is_first else None, question.state)
+                self._pending = None
+            if episode == answered_episode:
+                request = None  # the policy has it already
+            answer = self._answer(request, query.state)
             if not isinstance(answer, TransportError):
                 answered_episode = episode
             with self._changed:
-                self._busy = False
+                self._is_busy = False
                 if episode == self._episode:
-                    self._outcome = Outcome(answer, question.time)
+                    self._outcome = Outcome(answer, query.time)
                 self._changed.notify_all()
 
     def _answer(self, request: GraspRequest | None, state: State) -> Answer | TransportError:
-        """The policy's answer, or a TransportError for any failure.
+        """Returns the policy's answer, or a TransportError for any failure.
 
         Args:
           request: begins an episode first; None continues the current one.

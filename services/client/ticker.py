@@ -13,8 +13,8 @@ _MAX_DELAYS = 6000  # ticks whose delay is remembered: a minute at 100 Hz
 class Ticker:
     """Ticks at multiples of a period.
 
-    A tick that is late by a period or more has missed its deadline. Missed ticks are skipped to
-    avoid a burst.
+    If a tick is late by one or more periods, that many of the following ticks are skipped, so that
+    there is no burst.
 
     Attributes:
       period: s.
@@ -28,6 +28,9 @@ class Ticker:
 
         Args:
           rate: Hz, at most 100: the policies act every 10 ms.
+
+        Raises:
+          CongraspError: the rate is not valid.
         """
         if not 0.0 < rate <= 100.0:
             raise CongraspError(f"The rate is {rate:g} Hz.", "The policies act at up to 100 Hz.")
@@ -40,18 +43,20 @@ class Ticker:
 
     def wait(self) -> float:
         """Waits until the next tick; returns its time, of `time.monotonic`."""
-        while (rest := self._due - time.monotonic()) > 0:
-            time.sleep(rest)
+        while (remaining_s := self._due - time.monotonic()) > 0:
+            time.sleep(remaining_s)
         now = time.monotonic()
-        late = now - self._due
-        skipped = int(late / self.period)
+        delay_s = now - self._due
+        skipped = int(delay_s / self.period)
         self.ticks += 1
         self.missed += skipped
         self._due += (1 + skipped) * self.period
-        self._delays_ms.append(1e3 * late)
-        self.longest_ms = max(self.longest_ms, 1e3 * late)
+        self._delays_ms.append(1e3 * delay_s)
+        self.longest_ms = max(self.longest_ms, 1e3 * delay_s)
         return now
 
     def jitter_ms(self, percentile: float) -> float:
-        """A percentile of the delays of the last `_MAX_DELAYS` ticks, ms."""
-        return float(np.percentile(self._delays_ms, percentile)) if self._delays_ms else 0.0
+        """Returns a percentile (0 to 100) of the delays of the last `_MAX_DELAYS` ticks, ms."""
+        if not self._delays_ms:
+            return 0.0
+        return float(np.percentile(self._delays_ms, percentile))
