@@ -20,7 +20,7 @@ from congrasp.common.io.files import cache_folder, replacement, write_atomically
 _MANIFEST = "caches.json"
 _PROGRAMS = "jax"
 """Name of the cache of compiled programs."""
-_NOT_HIDDEN = "[!.]*"
+_NOT_HIDDEN = "[!.]*"  # hidden files are those that another process is writing
 _REMEDY = "Pass a file that 'congrasp warmup --export' wrote."
 
 

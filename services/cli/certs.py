@@ -14,7 +14,7 @@ from congrasp.common.transport.security import CERTIFICATE_FILE, LISTENERS, ROLE
 Folder = Annotated[pathlib.Path, tyro.conf.Positional]
 Role = Literal["learner", "actor", "server", "client", "observer"]
 _SOON_DAYS = 30
-"""Days before its expiry from which on a certificate is marked."""
+"""A certificate that expires in fewer days is marked."""
 
 
 def init(
@@ -44,7 +44,8 @@ def init(
 
     create_authority(folder, run=run, force=force)
     for role in ROLES:
-        issue(folder, role, number=0, hosts=host if role in LISTENERS else (), force=force)
+        hosts = host if role in LISTENERS else ()
+        issue(folder, role, number=0, hosts=hosts, force=force)
     return show(folder)
 
 
@@ -80,8 +81,8 @@ def issue(
     """
     from congrasp.services.ops.certificates import issue, read
 
-    made = issue(folder, role, run=run, number=number, hosts=host, days=days, force=force)
-    print(f"{made}: valid until {read(made / CERTIFICATE_FILE).expires:%Y-%m-%d}")
+    target = issue(folder, role, run=run, number=number, hosts=host, days=days, force=force)
+    print(f"{target}: valid until {read(target / CERTIFICATE_FILE).expires:%Y-%m-%d}")
     return 0
 
 

@@ -28,7 +28,8 @@ from congrasp.services.ops.interrupts import check_stopped
 from congrasp.services.ops.logs import announce_progress
 
 Track = Callable[[str, int | None], Callable[[int], None]]
-"""(label, total if known) -> function to call with the number done."""
+"""Function that adds a bar with a label and a total, None if that is unknown. It returns a function
+to call with the number of completed steps."""
 
 
 def in_range(least: float, most: float = math.inf, unit: str = "", **options: float) -> None:
@@ -98,26 +99,29 @@ def bars() -> Iterator[Progress]:
         TimeElapsedColumn(),
     )
     console = Console(stderr=True)
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as progress:
-        told = (
-            contextlib.nullcontext()
-            if console.is_terminal
-            else announce_progress(functools.partial(current_activity, progress))
-        )
-        with told:
-            yield progress
+    with (
+        Progress(
+            *columns, console=console, transient=True, disable=not console.is_terminal
+        ) as progress,
+        contextlib.ExitStack() as stack,
+    ):
+        if not console.is_terminal:
+            activity = functools.partial(current_activity, progress)
+            stack.enter_context(announce_progress(activity))
+        yield progress
 
 
 def current_activity(progress: Progress) -> str:
-    """Returns the newest unfinished task and its counts, as a line for output without bars."""
-    tasks = [
-        task for task in progress.tasks if task.visible and not task.finished
-    ] or progress.tasks
+    """Returns the newest unfinished task, or else the newest one, and its counts, as a line for
+    output without bars.
+    """
+    tasks = progress.tasks  # a copy: another thread may remove a task meanwhile
     if not tasks:
         return "Starting"
     task = tasks[-1]
+    for other in tasks:
+        if other.visible and not other.finished:
+            task = other
     if not task.completed:
         return task.description
     if not task.total:

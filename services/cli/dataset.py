@@ -82,7 +82,7 @@ class Dataset:
 
         in_range(1, per_object=self.per_object)
         in_range(0, shard=self.shard, batch=self.batch)
-        part, parts = _part(self.part)
+        first_shard, parts = _part(self.part)
         gpus = several_gpus(self.physics)
         recipe = self._recipe(gpus is not None)
         pools = pools_of(recipe)
@@ -93,7 +93,7 @@ class Dataset:
         if (self.out / CARD).exists():
             # Drops the checksums of deleted shards: on a GPU a shard made again may differ.
             write_card(shards, recipe.about, facts)
-        of_part = range(part, shards.total, parts)
+        of_part = range(first_shard, shards.total, parts)
         missing = [number for number in of_part if number not in finished]
         with tracked() as track:
             objects = min(len(recipe.objects), pools.pool_size * len(missing))
@@ -177,7 +177,7 @@ class Dataset:
 
 
 def _part(text: str) -> tuple[int, int]:
-    """Returns K - 1 and N of a text K/N."""
+    """Returns K - 1 and N of a text K/N; raises a CongraspError for another text."""
     part, slash, parts = text.partition("/")
     if slash and part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts):
         return int(part) - 1, int(parts)

@@ -13,6 +13,7 @@ _DEVICE_ERROR = 1
 """Exit code if memory does not suffice: a run restarts its processes, because another program may
 have held the memory."""
 _FULL_DISK_NUMBERS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Numbers of the system for a full disk, quota or file."""
 _PATH_ERRORS = (
     FileNotFoundError,
     NotADirectoryError,
@@ -21,6 +22,7 @@ _PATH_ERRORS = (
     FileExistsError,
 )
 _PATH_NUMBERS = (errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP)
+"""Numbers of further errors of a path, which have no class in Python."""
 _MEMORY_REMEDY = (
     "Choose fewer --environments or a smaller --batch; on a GPU, XLA_PYTHON_CLIENT_MEM_FRACTION is "
     "JAX's share of it."
@@ -29,8 +31,7 @@ _NO_MEMORY = re.compile(
     r"(?:out[ _]of[ _]memory|failed to allocate (?:request for )?\d)[^[\n]*|RESOURCE_EXHAUSTED",
     re.IGNORECASE,
 )
-
-
+"""Messages of libraries about a device without enough memory."""
 _NO_LIBRARY = re.compile(
     r"cannot open shared object|undefined symbol|version `\S+' not found|invalid ELF header"
     r"|wrong ELF class|cannot allocate memory in static TLS block|failed to map segment"
@@ -55,7 +56,7 @@ def failure_of(error: Exception) -> Failure | None:
         return _usage_failure(_unloadable_text(error))
     if isinstance(error, OSError):
         return _usage_failure(_system_text(error))
-    # Libraries whose own types would have to be imported raise these
+    # Bases of the libraries' own types, which are not imported for this
     if isinstance(error, RuntimeError | ValueError | AssertionError):
         return _library_failure(error)
     if isinstance(error, ModuleNotFoundError):

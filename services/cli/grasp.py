@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     from congrasp.services.grasp.result import Result
 
 NOT_HELD = 1
+"""Exit code if an object is not held."""
 BAD_INPUT = 2
+"""Exit code if an object cannot be used."""
 _MAX_ATTEMPTS = 1024
 _FILMED_APPROACH_S = 0.7
 _FILMED_LIFT_M = 0.12
@@ -34,8 +36,13 @@ _FILMED_LIFT_M = 0.12
 
 def _field(option: Option) -> tuple[str, Any, Any]:
     """Name, annotation and default of an option as the field of a dataclass."""
-    kind: Any = bool if option.switch else tuple[str, ...] if option.many else str
-    return option.name, Annotated[kind, Doc(option.help)], kind()
+    kind: Any = str
+    if option.switch:
+        kind = bool
+    elif option.many:
+        kind = tuple[str, ...]
+    empty = kind()  # False, "" or ()
+    return option.name, Annotated[kind, Doc(option.help)], empty
 
 
 def _fields() -> list[tuple[str, Any, Any]]:

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from congrasp.common.hands.spec import Hand
     from congrasp.services.assets.hands.model_files import Choices, Proposal
 
-
 _TRAININGS = pathlib.Path("runs", "hands")
 """Folder of the trainings of hands."""
 
@@ -319,7 +318,7 @@ class Train:
         check_output("--out", self.out or _TRAININGS, is_folder=True)
         platform, *_ = accelerators.detect()
         full = platform != "cpu"
-        # The stages are separate processes, each with the whole GPU memory
+        # The stages are separate processes, to which this one leaves the memory of the GPU.
         jax.config.update("jax_platforms", "cpu")
         choices = Choices(self.name, self.palm, self.thumb, self.object_scale)
         reference = _imported(self.hand, choices)

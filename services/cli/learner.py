@@ -136,8 +136,8 @@ def learner(
     rank = options.rank
     config = with_hand(config, options.hand)
     url = rank_url(options.listen, rank)
-    # Other ranks use the settings of rank 0
-    longest = longest_rollout(config) if options.ranks == 1 else None
+    # With several ranks, the configuration is that of rank 0, which is not known yet.
+    max_rollout_bytes = longest_rollout(config) if options.ranks == 1 else None
     try:
         with (
             on_signal() as stop,
@@ -148,7 +148,7 @@ def learner(
                 certs=options.certs,
                 insecure=options.shared.insecure,
                 run=config.name,
-                longest_rollout=longest,
+                longest_rollout=max_rollout_bytes,
             ) as transport,
             contextlib.ExitStack() as stack,
         ):
@@ -160,6 +160,7 @@ def learner(
                 if is_new:
                     stack.enter_context(removed_without_checkpoint(before))
                 stack.enter_context(listening(run_dir, reachable_url(url)))
+            # All ranks send their configuration, and use that of rank 0.
             ranks = Ranks.join(rank, options.ranks, options.coordinator)
             entries = ranks.exchange({"config": to_json(config)}).meta["entries"]
             config = run_config_from_json(entries[0]["config"])

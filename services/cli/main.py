@@ -80,7 +80,7 @@ UNREAD = BROKEN_PIPE_CODE
 _REPORT_THEIR_END = ("train", "learner", "actor", "serve", "record", "view")
 """Commands that print or log themselves that a signal stopped them, once they have started."""
 _LATE_SIGNAL_S = 1.0
-"""Longest wait for the thread that records a signal, s."""
+"""Longest wait for the thread that records a signal."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -109,6 +109,7 @@ def _exit_code(arguments: list[str], debug: bool) -> int:
     try:
         return run(arguments)
     except BrokenPipeError:
+        # If the output can still be written, another pipe is broken, which is a bug.
         is_another_pipe = write_if_possible(sys.stdout, "\n")
         if is_another_pipe:
             raise
@@ -147,15 +148,17 @@ def run(arguments: list[str]) -> int:
     check_xla_flags()
     prepare_environment()
     interrupted = False
-    result = None
+    code = 0
     with on_signal(interrupt=True) as stop:
         try:
             with interrupts_reach(stop):
                 result = _call(name, rest)
+                if isinstance(result, int):
+                    code = result
         except KeyboardInterrupt:
             interrupted = True
             stop.wait(_LATE_SIGNAL_S)
-        code = stop.exit_code or (result if isinstance(result, int) else 0)
+        code = stop.exit_code or code
     if code in SIGNALLED and (interrupted or name not in _REPORT_THEIR_END):
         write_if_possible(sys.stderr, f"{stopped_line(code)}\n")
     return code

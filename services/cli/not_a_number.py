@@ -1,4 +1,4 @@
-"""Refusal of options that are not a number (`nan`), which every comparison lets pass."""
+"""Refusal of options that are not a number (`nan`), which pass checks such as `value < 0`."""
 
 import dataclasses
 import math
@@ -9,8 +9,8 @@ from congrasp.common.errors import CongraspError
 
 
 def check_numbers(parameters: Mapping[str, Any]) -> None:
-    """Raises a CongraspError for the first option of a configuration (with a dot) that is NaN;
-    commands check the range of their other options themselves.
+    """Raises a CongraspError for the first option of a nested configuration, such as
+    `--ppo.clip`, that is NaN; commands check the range of their other options themselves.
 
     Args:
       parameters: parameters of a command; a group of options is a dataclass.
@@ -21,14 +21,20 @@ def check_numbers(parameters: Mapping[str, Any]) -> None:
 
 
 def _check(options: Mapping[str, Any], prefix: str) -> None:
-    """Raises a CongraspError for the first option, or field of one, that is NaN."""
+    """Raises a CongraspError for the first option, or field of one, that is NaN.
+
+    Args:
+      options: values by name.
+      prefix: names of the records around them, each with a dot; empty for the outermost ones, which
+        are not checked themselves.
+    """
     for name, value in options.items():
         option = f"{prefix}{name.replace('_', '-')}"
         if _is_record(value):
             _check(_fields(value), f"{option}.")
             continue
-        values = value if isinstance(value, tuple) else (value,)
-        if prefix and any(isinstance(one, float) and math.isnan(one) for one in values):
+        numbers = value if isinstance(value, tuple) else (value,)
+        if prefix and any(isinstance(number, float) and math.isnan(number) for number in numbers):
             raise CongraspError(f"--{option} is nan, which is not a number.", "Give a number.")
 
 

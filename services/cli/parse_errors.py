@@ -12,7 +12,7 @@ from congrasp.services.cli.shell_specs import spec_of
 _BORDER = "│"
 _RULE = "─"
 _SUGGESTS = "Perhaps you meant:"
-"""Line of the box that precedes similar options."""
+"""Line of the box before similar options."""
 
 
 class _Box(NamedTuple):
@@ -55,7 +55,7 @@ def parse(
 
 
 def _read_box(text: str) -> _Box:
-    """Reads the cause above the first rule of the box, and the options below it."""
+    """Reads the cause, above the first rule in the box, and similar options, below it."""
     lines = [line.strip(f"{_BORDER} ") for line in text.splitlines() if line.startswith(_BORDER)]
     end_of_cause = len(lines)
     for index, line in enumerate(lines):

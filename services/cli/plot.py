@@ -45,13 +45,14 @@ def plot(
         raise CongraspError(
             "The figures of several runs have no default folder.", "Pass a folder with --out."
         )
-    folder = out or (paths[0] if paths[0].is_dir() else paths[0].parent) / "plots"
+    source_folder = paths[0] if paths[0].is_dir() else paths[0].parent
+    folder = out or source_folder / "plots"
     check_output("--out", folder, is_folder=True)
-    for file in (
-        plot_evaluation(paths[0], folder, formats)
-        if evaluations
-        else plot_runs(paths, folder, formats)
-    ):
+    if evaluations:
+        files = plot_evaluation(paths[0], folder, formats)
+    else:
+        files = plot_runs(paths, folder, formats)
+    for file in files:
         print(file)
     return 0
 

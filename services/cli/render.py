@@ -8,7 +8,7 @@ import tyro
 from congrasp.common.hands import get_hand
 from congrasp.services.cli.console import in_range
 
-_FRAMED = 10  # control steps between the frames that the camera of a robot must contain
+_FRAMING_STEP = 10  # the camera of a robot must contain every tenth frame
 
 
 def hand(hand: str = "human", out: pathlib.Path = pathlib.Path("hand.png")) -> int:
@@ -66,7 +66,7 @@ def episode(
     if video is not None:
         film = Film(overlays=True)
         if chosen.arm:
-            framed = range(0, chosen.steps, _FRAMED)
+            framed = range(0, chosen.steps, _FRAMING_STEP)
             save_robot_video(video, chosen.arm, chosen, film, framed)
         else:
             save_episode_video(video, chosen, film)

@@ -14,7 +14,7 @@ from congrasp.services.cli.console import in_range, tracked
 if TYPE_CHECKING:
     from congrasp.services.evaluate.report import HandCheck
 
-_POOL = 64
+_DEFAULT_POOL = 64
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Report:
     """Number of episodes per row."""
     physics: PhysicsName = "auto"
     """Engine; auto takes warp on an NVIDIA GPU and native (MuJoCo C) on a CPU."""
-    pool: int = _POOL
+    pool: int = _DEFAULT_POOL
     """Number of procedural objects."""
     seed: int = 0
     """Seed of constraints and episodes."""

@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 import shlex
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from congrasp.actors.physics import PhysicsName
 from congrasp.common.errors import CongraspError
@@ -18,14 +18,21 @@ if TYPE_CHECKING:
 
 _RUNS_FOLDER = "policies"
 """Folder of trainings within the output folder."""
-_QUICK_EPISODES = 48
-_QUICK_POOL = 24
-_FULL_EPISODES = 1000
-_FULL_POOL = 64
-"""Episodes of a row, and procedural objects, with and without --quick."""
-_QUICK_MANY = 2
-_FULL_MANY = 50
-"""Episodes of the table of many objects per episode of a row."""
+
+
+class _Size(NamedTuple):
+    """Default size of an evaluation."""
+
+    episodes: int
+    """Episodes of each row."""
+    pool: int
+    """Procedural objects."""
+    many: int
+    """Episodes of the table of many objects, for each episode of a row."""
+
+
+_FULL = _Size(episodes=1000, pool=64, many=50)
+_QUICK = _Size(episodes=48, pool=24, many=2)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,7 +105,7 @@ class Reproduce:
         policy_request = PolicyRequest(
             hands=hands,
             methods=methods,
-            given=_given(self.policy, required_policies(hands, methods)),
+            given=_given_policies(self.policy, required_policies(hands, methods)),
             pretrained=self.quick,
             runs=self.out / _RUNS_FOLDER,
             options=tuple(shlex.split(self.training)),
@@ -129,12 +136,12 @@ class Reproduce:
         """Numbers of episodes and objects, engine and seed."""
         from congrasp.services.evaluate.paper.evaluation import PartSettings
 
-        episodes = self.episodes or (_QUICK_EPISODES if self.quick else _FULL_EPISODES)
-        many = _QUICK_MANY if self.quick else _FULL_MANY
+        size = _QUICK if self.quick else _FULL
+        episodes = self.episodes or size.episodes
         return PartSettings(
             episodes=episodes,
-            pool=self.pool or (_QUICK_POOL if self.quick else _FULL_POOL),
-            many=many * episodes,
+            pool=self.pool or size.pool,
+            many=size.many * episodes,
             physics=self.physics,
             seed=self.seed,
         )
@@ -155,14 +162,19 @@ def _check_names(hands: Sequence[str], methods: Sequence[str]) -> None:
             raise CongraspError(
                 f"'{name[:60]}' is no hand's name.", "Choose from 'congrasp hands list'."
             )
-    if unknown := set(methods) - set(BASELINES):
+    unknown = set(methods) - set(BASELINES)
+    if unknown:
         raise CongraspError(
             f"There is no method '{min(unknown)}'.", f"Choose from: {', '.join(BASELINES)}."
         )
 
 
-def _given(texts: tuple[str, ...], needed: "list[PolicyKey]") -> "dict[PolicyKey, Entrant]":
-    """Policies by hand and method; raises a CongraspError for one that no table needs."""
+def _given_policies(
+    texts: tuple[str, ...], needed: "list[PolicyKey]"
+) -> "dict[PolicyKey, Entrant]":
+    """Returns the policies of --policy by hand and method; raises a CongraspError for one that no
+    table needs.
+    """
     from congrasp.services.evaluate.lineup import read_entrants
 
     entrants = {entrant.key: entrant for entrant in read_entrants(texts)}

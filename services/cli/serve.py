@@ -60,8 +60,8 @@ class Serve:
         """Serves until a signal."""
         starting = contextlib.ExitStack()
         starting.enter_context(announce_progress("Loading and compiling the policy"))
-        # Waking a thread costs more than it saves in one policy's inference: no pool (JAX reads it
-        # when it starts) ...
+        # Waking a thread costs more than it saves in one policy's inference. So JAX has no pool of
+        # threads, whose size it reads at its import, and computes in the calling thread (below).
         os.environ.setdefault("NPROC", "1")
 
         import jax
@@ -75,10 +75,11 @@ class Serve:
                 f"The server can follow either {self.policy} or {self.connect}.",
                 "Pass one of --policy and --connect.",
             )
-        jax.config.update("jax_cpu_enable_async_dispatch", False)  # ... and no handing over
+        jax.config.update("jax_cpu_enable_async_dispatch", False)
         metrics = ServerMetrics()
+        run = self.run if self.connect else ""
         with (
-            self.monitoring.monitor("server", self.name, self.run if self.connect else "", metrics),
+            self.monitoring.monitor("server", self.name, run, metrics),
             starting,
             contextlib.ExitStack() as stack,
         ):
@@ -93,7 +94,7 @@ class Serve:
             transport = stack.enter_context(
                 urls.listen(self.listen, "server", certs=self.certs, insecure=self.insecure)
             )
-            # Ctrl-C interrupts the compilation, which is a part of this
+            # Signals are not handled yet: Ctrl-C interrupts the compilation, which this contains.
             server = PolicyServer(
                 transport, self.name, source, on_answer=metrics.answer, on_batch=metrics.batch
             )

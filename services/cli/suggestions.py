@@ -16,28 +16,31 @@ _NUMBER = re.compile(
 )
 _UNRECOGNIZED = re.compile(r"Unrecognized options: (?P<words>.*)", re.DOTALL)
 _GLOBAL = ("--help", "--version")
+"""Options without a command."""
 _WORDS = {"help": "--help", "version": "--version", "-v": "--version", "-V": "--version"}
 """Commands and options of other programs, and their equivalents."""
 
 
 def nearest(word: str, names: Iterable[str]) -> str:
     """Returns the name that is most similar to a word, without regard to case; empty if none is."""
-    by_case = {name.lower(): name for name in names}
-    near = difflib.get_close_matches(word.lower(), by_case, 1, _CUTOFF)
-    return by_case[near[0]] if near else ""
+    by_lower_case = {name.lower(): name for name in names}
+    matches = difflib.get_close_matches(word.lower(), by_lower_case, 1, _CUTOFF)
+    return by_lower_case[matches[0]] if matches else ""
 
 
 def nearest_option(word: str, names: Sequence[str]) -> str:
-    """Returns the option that a word resembles; of a dotted one first the last part is compared,
-    among the options of its group.
+    """Returns the option that a word resembles; empty if none does.
+
+    The last part of a dotted word such as `--ppo.clipp` is first compared with the options of its
+    group.
     """
     group, dot, last = word.rpartition(".")
     if dot:
-        start = group + dot
-        in_group = [name.removeprefix(start) for name in names if name.startswith(start)]
-        near = nearest(last, in_group)
-        if near:
-            return start + near
+        prefix = group + dot
+        in_group = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
+        similar = nearest(last, in_group)
+        if similar:
+            return prefix + similar
     return nearest(word, names)
 
 
@@ -58,7 +61,7 @@ def command_remedy(arguments: Sequence[str], commands: Sequence[str]) -> str:
 
 
 def plain_error(text: str) -> str:
-    """Returns an error of the parser without terms of Python."""
+    """Returns an error of the parser, without terms of Python if it is about a number."""
     match = _NUMBER.fullmatch(text)
     if match is None:
         return text
@@ -80,7 +83,7 @@ def similar_words(
     Args:
       words: the unrecognized words.
       arguments: arguments of the command.
-      spec: options and subcommands of the command (`services.cli.completion`).
+      spec: options and subcommands of the command (`services.cli.shell_specs`).
     """
     while arguments and arguments[0] in spec["subcommands"]:
         spec = spec["subcommands"][arguments[0]]

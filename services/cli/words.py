@@ -1,4 +1,4 @@
-"""Words of a command line that no shell or a word processor has prepared: homes that are not
+"""Words of a command line that are not what the user means: home folders that the shell has not
 expanded, and the dashes and quotation marks of typeset text.
 """
 
@@ -16,10 +16,10 @@ _TYPESET_QUOTES = ("\u2018", "\u2019", "\u201c", "\u201d", "\u00ab", "\u00bb")
 
 
 def expand_homes(arguments: Sequence[str]) -> list[str]:
-    """Returns words with the home in place of a leading `~`, as of `--out=~/grasps`, which bash
-    leaves.
+    """Returns words with the home folder in place of a leading `~`.
 
-    A folder named `~` would be created otherwise; a file of such a name is `./~`.
+    Shells expand a word that begins with `~`, but bash leaves `--out=~/grasps`, for which a folder
+    named `~` would be created. A file of this name can be written as `./~`.
     """
     expanded = []
     for argument in arguments:
