@@ -23,6 +23,12 @@ def save_episode(path: pathlib.Path, actor: str, episode: Episode) -> None:
         writer = LogWriter(path.parent, f".{path.stem}", run=episode.object)
         start = time.time_ns()
         raw = raw_entry(actor, episode.to_message(), start)
-        writer.write(raw, *scene_entries(actor, episode, start, 0, JsonChannels()))
-        writer.close()
-        platforms.replace(writer.files[-1], path)
+        try:
+            writer.write(raw, *scene_entries(actor, episode, start, 0, JsonChannels()))
+            writer.close()
+            platforms.replace(writer.files[-1], path)
+        except BaseException:  # also an interrupt
+            writer.abandon()
+            for file in writer.files:
+                file.unlink(missing_ok=True)
+            raise

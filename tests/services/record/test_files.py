@@ -20,6 +20,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from congrasp.common.errors import CongraspError
 from congrasp.common.wire.codec import Message, encode
 from congrasp.services.export.layout import export_layout
+from congrasp.services.record.episode_file import save_episode
 from congrasp.services.record.reader import (
     log_files,
     read_episodes,
@@ -35,6 +36,7 @@ from congrasp.services.record.writer import (
     opaque_channel,
 )
 from tests.children import python
+from tests.episodes import episode
 from tests.limits import limited
 from tests.recordings import is_complete
 
@@ -186,6 +188,14 @@ def test_a_full_disk_is_an_error_and_keeps_what_was_flushed(tmp_path: pathlib.Pa
     writer.abandon()
     assert flushed > 9
     assert updates(log_files(tmp_path)[0])[: flushed + 1] == [*range(flushed + 1)]
+
+
+def test_an_episode_that_cannot_be_saved_leaves_no_file(tmp_path: pathlib.Path) -> None:
+    folder = tmp_path / "grasp.mcap"
+    folder.mkdir()
+    with pytest.raises(CongraspError, match="could not be written"):
+        save_episode(folder, "grasp", episode(3))
+    assert list(tmp_path.iterdir()) == [folder]
 
 
 def test_another_kind_of_file_is_refused(tmp_path: pathlib.Path) -> None:
