@@ -7,6 +7,7 @@ import numpy as np
 from congrasp.common.errors import CongraspError
 from congrasp.common.request import Pose
 from congrasp.services.client.arrays import as_numbers
+from congrasp.services.client.fields import position_and_quaternion
 
 _NORMAL_TOLERANCE = 1e-3  # of the length of a plane's normal
 _QUATERNION_TOLERANCE = 0.02  # of the length of a measured quaternion
@@ -25,11 +26,13 @@ class Floor:
           palm: see `JointLimits`.
 
         Raises:
-          CongraspError: the normal is not of length 1, or a number is not finite.
+          CongraspError: the wrist is not a pose, the normal is not of length 1, or a number is not
+            finite.
         """
         plane = as_numbers(plane, 4)
-        position = as_numbers(wrist[0], 3)
-        quaternion = as_numbers(wrist[1], 4)
+        wrist_position, wrist_quaternion = position_and_quaternion("wrist", wrist)
+        position = as_numbers(wrist_position, 3)
+        quaternion = as_numbers(wrist_quaternion, 4)
         is_normal = abs(np.linalg.norm(plane[:3]) - 1.0) < _NORMAL_TOLERANCE
         is_rotation = abs(np.linalg.norm(quaternion) - 1.0) < _QUATERNION_TOLERANCE
         if not is_normal or not is_rotation:

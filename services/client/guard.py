@@ -16,6 +16,7 @@ from congrasp.common.errors import CongraspError, RefusedError, TransportError
 from congrasp.common.request import GraspRequest
 from congrasp.common.transport.base import Closing
 from congrasp.services.client.arrays import as_numbers
+from congrasp.services.client.fields import position_and_quaternion
 from congrasp.services.client.floor import Floor
 from congrasp.services.client.limiter import Limiter
 from congrasp.services.client.limits import JointLimits
@@ -193,11 +194,12 @@ class Guard(Closing):
             also start from `q`.
 
         Raises:
-          CongraspError: its `q` is not a finite angle for each finger joint, or its `wrist` no
-            pose.
+          CongraspError: its `q` is not a finite angle for each finger joint, or its `wrist` or
+            `object_pose` is not a pose. The earlier episode then continues.
           ForkError: the guard was opened before this process was forked.
         """
         self._queries.require_same_process()
+        object_position, _ = position_and_quaternion("object_pose", request.object_pose)
         start = np.append(as_numbers(request.q, self._fingers), np.zeros(6))
         if self._limiter is not None and not moved and np.isfinite(start).all():
             start[: self._fingers] = self._limiter.target[: self._fingers]
@@ -211,7 +213,6 @@ class Guard(Closing):
         self._answer = None
         self._latched_mode = None
         self._holds_object = False
-        object_position = request.object_pose and request.object_pose[0]
         self._first_height = as_numbers(object_position, 3)[2]
         self._sizes = {"q": self._fingers, "u": 6}
         if request.cloud is None:

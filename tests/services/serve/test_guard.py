@@ -471,6 +471,15 @@ def test_invalid_guard_options_are_refused():
             guard.reset(GraspRequest())
 
 
+@pytest.mark.parametrize("name", ["wrist", "object_pose"])
+def test_a_pose_that_is_no_pair_is_refused(name):
+    with Guard(ScriptedPolicy(None), LIMITS, OPEN) as guard:
+        with pytest.raises(CongraspError, match=f"'{name}' must be a"):
+            guard.reset(dataclasses.replace(REQUEST, **{name: (REST,)}))
+        with pytest.raises(RefusedError, match="no episode"):
+            guard.step(STATE)
+
+
 def test_a_ticker_counts_the_ticks_that_it_leaves_out():
     ticker = Ticker(100.0)
     first = ticker.wait()
