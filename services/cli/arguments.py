@@ -1,5 +1,6 @@
 """Values of options before a command line is parsed, for defaults that depend on them."""
 
+import itertools
 from collections.abc import Sequence
 
 
@@ -9,9 +10,12 @@ def has_option(option: str, arguments: Sequence[str]) -> bool:
 
 
 def option_value(option: str, arguments: Sequence[str]) -> str:
-    """Returns the value of an option on a command line; empty if it is absent."""
-    for word, following in zip(arguments, [*arguments[1:], ""], strict=True):
-        name, _, value = word.partition("=")
+    """Returns the value of an option on a command line; empty if it is absent. The last of several
+    counts, as for the parser.
+    """
+    value = ""
+    for word, following in itertools.zip_longest(arguments, arguments[1:], fillvalue=""):
+        name, equals_sign, attached = word.partition("=")
         if name == option:
-            return value or following
-    return ""
+            value = attached if equals_sign else following
+    return value

@@ -14,6 +14,7 @@ import os
 import pathlib
 import secrets
 import shutil
+import tempfile
 from collections.abc import Sequence
 
 from cryptography import x509
@@ -154,14 +155,22 @@ def issue(
         .sign(ca_key, hashes.SHA256())
     )
     target = folder / f"{role}.{identity.number}"
-    if target.exists():
-        shutil.rmtree(target)
-    target.mkdir(mode=0o700)
-    _write_secret(target / KEY_FILE, key)
-    (target / CERTIFICATE_FILE).write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
-    shutil.copyfile(folder / CA_FILE, target / CA_FILE)
+    files = {
+        CERTIFICATE_FILE: certificate.public_bytes(serialization.Encoding.PEM),
+        CA_FILE: (folder / CA_FILE).read_bytes(),
+    }
     if (folder / REVOKED_FILE).exists():
-        shutil.copyfile(folder / REVOKED_FILE, target / REVOKED_FILE)
+        files[REVOKED_FILE] = (folder / REVOKED_FILE).read_bytes()
+    # The files are complete before they replace a certificate, which a full disk then cannot cost.
+    with tempfile.TemporaryDirectory(prefix=".new-", dir=folder) as temporary:
+        complete = pathlib.Path(temporary, target.name)
+        complete.mkdir(mode=0o700)
+        _write_secret(complete / KEY_FILE, key)
+        for name, content in files.items():
+            (complete / name).write_bytes(content)
+        if target.exists():
+            shutil.rmtree(target)
+        complete.rename(target)
     return target
 
 

@@ -1,6 +1,8 @@
 """The authority and its certificates, as files and as OpenSSL sees them."""
 
 import datetime
+import errno
+import pathlib
 import shutil
 import stat
 import subprocess
@@ -117,6 +119,22 @@ def test_invalid_certificate_requests_are_refused(folder, role, options, words):
     with pytest.raises(CongraspError, match=words):
         issue(folder, role, **options)
     assert [one.name for one in certificates(folder)] == ["ca"]
+
+
+def test_certificate_is_kept_if_its_successor_cannot_be_written(tmp_path, monkeypatch):
+    create_authority(tmp_path)
+    before = (issue(tmp_path, "actor") / "tls.crt").read_bytes()
+
+    def fail(*arguments):
+        raise OSError(errno.ENOSPC, "no space left on device")
+
+    with monkeypatch.context() as full_disk, pytest.raises(OSError):
+        full_disk.setattr(pathlib.Path, "write_bytes", fail)
+        issue(tmp_path, "actor", number=0, force=True)
+    assert (tmp_path / "actor.0" / "tls.crt").read_bytes() == before
+    issue(tmp_path, "actor", number=0, force=True)
+    assert (tmp_path / "actor.0" / "tls.crt").read_bytes() != before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["actor.0", "ca.crt", "ca.key"]
 
 
 def test_credentials_are_checked_before_they_are_used(folder, tmp_path):
