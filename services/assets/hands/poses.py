@@ -55,7 +55,7 @@ _CLOSING_STEPS = 40
 _MAX_EVALUATIONS = 40
 _DIFFERENCE = 0.02
 """Half step of a motor for its tip's velocity, rad."""
-_THUMB = re.compile(r"thumb|(^|_)th(j?\d|base|prox|hub|mid|dist)", re.IGNORECASE)
+_THUMB = re.compile(r"thumb|(^|_)th(_|j?\d|base|prox|hub|mid|dist)", re.IGNORECASE)
 
 
 class _OpenHand(NamedTuple):

@@ -211,6 +211,39 @@ def test_a_link_of_many_parts_is_drawn_by_a_coarse_hull(tmp_path):
     np.testing.assert_allclose(np.abs(vertices).max(), 0.03, atol=0.003)
 
 
+@pytest.mark.parametrize("names", [("th_", "index_"), ("index_", "th_")])
+def test_links_named_th_are_the_thumb(names, tmp_path):
+    """The two fingers are mirror images, so that only their names decide."""
+    text = (pathlib.Path(__file__).parents[3] / "cases/_hand/pinch.xml").read_text()
+    for word, name in zip(("thumb_", "finger_"), names, strict=True):
+        text = text.replace(word, name)
+    (tmp_path / "hand.xml").write_text(text)
+    assert propose(tmp_path / "hand.xml").hand.thumb == "th_high"
+
+
+@pytest.mark.parametrize(
+    ("material", "reach"),
+    [('material="rubber"', 0.06), ('material="invisible"', 0.04), ("", 0.04)],
+)
+def test_a_colliding_mesh_of_an_opaque_material_is_drawn(material, reach, tmp_path):
+    """A fingertip of rubber, next to a visual shape that ends 2 cm before it."""
+    trimesh.creation.icosphere(2, 0.01).export(tmp_path / "tip.stl")
+    text = (pathlib.Path(__file__).parents[3] / "cases/_hand/pinch.xml").read_text()
+    box = '<geom type="box" size=".01 .006 .02" pos="0 0 .02"/>'
+    visual = '<geom type="box" size=".01 .006 .02" pos="0 0 .02" contype="0" conaffinity="0"/>'
+    tip = f'<geom type="mesh" mesh="tip" pos="0 0 .05" {material}/>'
+    assert text.count(box) == 2
+    text = text.replace(box, visual + tip)
+    materials = '<material name="rubber"/><material name="invisible" rgba="1 1 1 0"/>'
+    assets = f'<asset>{materials}<mesh name="tip" file="tip.stl"/></asset>'
+    (tmp_path / "hand.xml").write_text(text.replace("<asset/>", assets))
+    proposal = propose(tmp_path / "hand.xml")
+    vertices, _ = proposal.meshes["finger_high"]
+    links = {link.name: link for link in proposal.hand.links}
+    (knee,) = links["finger_high"].joints
+    assert (vertices - np.array(knee.anchor))[:, 2].max() == pytest.approx(reach, abs=1e-4)
+
+
 def test_any_number_of_meshes_may_be_missing(tmp_path):
     meshes = "".join(f'<mesh file="{i}.stl"/>' for i in range(301))
     text = (PINCH / "pinch.xml").read_text()
