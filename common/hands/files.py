@@ -24,6 +24,7 @@ run's configuration, of policies and of recorded episodes.
 import contextlib
 import dataclasses
 import functools
+import hashlib
 import itertools
 import json
 import pathlib
@@ -78,6 +79,11 @@ def hand_text(hand: Hand) -> str:
         if not link["solids"]:
             del link["solids"]
     return json.dumps({"format": FORMAT, **fields}, indent=1)
+
+
+def hand_sha256(hand: Hand) -> str:
+    """Returns the SHA-256 of the text of the hand's file (`hand_text`), in hexadecimal digits."""
+    return hashlib.sha256(hand_text(hand).encode()).hexdigest()
 
 
 def hand_from_text(text: str, source: str = "the hand file") -> Hand:

@@ -17,7 +17,7 @@ from congrasp.common.hands import (
     own_hands,
     right_name,
 )
-from congrasp.common.hands.files import hand_text
+from congrasp.common.hands.files import hand_sha256, hand_text
 from congrasp.common.hands.meshes import load_meshes, save_meshes
 from congrasp.common.io.files import check_output, write_atomically
 from congrasp.common.runtime.resources import cores
@@ -158,6 +158,8 @@ class Import:
     list' prints this folder)."""
     png: pathlib.Path | None = None
     """PNG file to write; by default next to the JSON file."""
+    json: Annotated[pathlib.Path | None, tyro.conf.arg(name="json")] = None
+    """Also write what was imported, with the notes, to this JSON file."""
 
     def __call__(self) -> int:
         """Writes the hand's file and picture, and prints how to train it."""
@@ -170,6 +172,8 @@ class Import:
         with announce_progress(f"Reading {self.file}"):
             proposal = import_hand(self.file, choices)
         _store(proposal, self.out, self.png)
+        if self.json is not None:
+            _write_record(self.json, proposal)
         reference = proposal.hand.name if self.out is None else self.out
         one_hand = shell_command("congrasp", "hands", "train", reference)
         any_hand = shell_command("congrasp", "train", "--hand", reference, "--physics", "native")
@@ -222,6 +226,14 @@ def _store(
     say(*describe(proposal), "", path, picture)
 
 
+def _write_record(file: pathlib.Path, proposal: "Proposal") -> None:
+    """Writes the record of an import."""
+    from congrasp.services.assets.hands.import_record import write_import
+    from congrasp.services.evaluate.results import provenance
+
+    write_import(file, proposal, provenance())
+
+
 def check(
     hand: Annotated[str, tyro.conf.Positional],
     png: pathlib.Path | None = None,
@@ -246,6 +258,7 @@ def check(
     """
     from congrasp.services.assets.hands import check as self_check
     from congrasp.services.assets.hands.findings import write_findings
+    from congrasp.services.evaluate.results import provenance
     from congrasp.services.train.presets import recipe
     from congrasp.services.viz import hand_sheets
     from congrasp.services.viz.sheets import save_png
@@ -258,7 +271,8 @@ def check(
         print(finding)
     save_png(picture, hand_sheets.check_sheet(spec, result.grips))
     if json is not None:
-        write_findings(json, result.findings)
+        about = {**provenance(), "hand": spec.name, "hand_sha256": hand_sha256(spec)}
+        write_findings(json, result.findings, about)
     print(picture)
     return int(result.failed)
 

@@ -3,7 +3,7 @@
 import dataclasses
 import pathlib
 import shlex
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -12,6 +12,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.services.cli.console import in_range, tracked
 
 if TYPE_CHECKING:
+    from congrasp.common.policy.bundle import PolicyBundle
     from congrasp.services.evaluate.report import HandCheck
 
 _DEFAULT_POOL = 64
@@ -63,6 +64,7 @@ class Report:
         from congrasp.services.evaluate.experiment import Experiment
         from congrasp.services.evaluate.report import report_on
         from congrasp.services.evaluate.scores import write_json
+        from congrasp.services.train.background import training_seconds
 
         in_range(1, episodes=self.episodes, pool=self.pool)
         run_dir = None
@@ -94,18 +96,34 @@ class Report:
                 check=hand_check,
             )
         if self.json is not None:
-            about = {
-                "policy": str(file),
-                "content": bundles.content_hash(file.read_bytes()),
-                "episodes": self.episodes,
-                "pool": self.pool,
-                "seed": self.seed,
-            }
+            about = {**self._about(file, bundle), "physics": experiment.physics}
+            if run_dir is not None:
+                about["training_seconds"] = training_seconds(run_dir)
             write_json(evaluation.rows, self.json, about)
         for error in evaluation.left_out:
             print(f"Left out: {error}")
         print(f"The report is in {self.out}: open it in a browser.")
         return 0
+
+    def _about(self, file: pathlib.Path, bundle: "PolicyBundle") -> dict[str, Any]:
+        """Provenance, policy, hand and settings, for the JSON file."""
+        from congrasp.common.hands import get_hand
+        from congrasp.common.hands.files import hand_sha256
+        from congrasp.common.policy import bundle as bundles
+        from congrasp.services.evaluate.results import provenance
+
+        hand = get_hand(bundle.spec.hand)
+        return {
+            **provenance(),
+            "policy": str(file),
+            "content": bundles.content_hash(file.read_bytes()),
+            "transitions": bundle.transitions,
+            "hand": hand.name,
+            "hand_sha256": hand_sha256(hand),
+            "episodes": self.episodes,
+            "pool": self.pool,
+            "seed": self.seed,
+        }
 
     def _subject(self, file: pathlib.Path) -> str:
         """Options of 'congrasp evaluate' that select the policy."""

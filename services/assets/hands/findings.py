@@ -2,8 +2,9 @@
 
 import json
 import pathlib
-from collections.abc import Sequence
-from typing import Literal, NamedTuple
+import types
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
@@ -59,10 +60,14 @@ def finding_of(check: str, verdict: Verdict, measured: str, remedy: str) -> Find
     return Finding(check, verdict, measured, "" if verdict == "passed" else remedy)
 
 
-def write_findings(path: pathlib.Path, findings: Sequence[Finding]) -> None:
-    """Writes findings as JSON for `read_findings`."""
+def write_findings(
+    path: pathlib.Path,
+    findings: Sequence[Finding],
+    about: Mapping[str, Any] = types.MappingProxyType({}),
+) -> None:
+    """Writes findings as JSON for `read_findings`, with the provenance `about` in front."""
     rows = [finding._asdict() for finding in findings]
-    write_atomically(path, json.dumps({"findings": rows}, indent=1).encode())
+    write_atomically(path, json.dumps({**about, "findings": rows}, indent=1).encode())
 
 
 def read_findings(path: pathlib.Path) -> list[Finding]:

@@ -14,6 +14,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.hands import get_hand
+from congrasp.common.hands.files import hand_sha256
 from congrasp.common.hands.skin import skin_of
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.task.config import SensingConfig, TaskConfig
@@ -100,6 +102,7 @@ def test_the_self_check_of_the_hand_is_part_of_a_report(tmp_path, policy, monkey
         [Finding("palm", "passed", "fine"), Finding("ball", "failed", "falls", "close <it>")],
     )
     bundles.save(policy, tmp_path / "policy.safetensors")
+    (tmp_path / "trained.json").write_text('{"seconds": 90}')
     rows = [row("heading", 0.99, 0.975, 0.995)]
     out = tmp_path / "report.html"
 
@@ -137,6 +140,11 @@ def test_the_self_check_of_the_hand_is_part_of_a_report(tmp_path, policy, monkey
     )
     assert [one["constraint"] for one in written["rows"]] == ["heading"]
     assert written["episodes"] == 8
+    assert written["hand"] == "human"
+    assert written["hand_sha256"] == hand_sha256(get_hand("human"))
+    assert written["transitions"] == policy.transitions
+    assert written["training_seconds"] == 90
+    assert written["physics"] == "native"
     (tmp_path / "check.json").write_text('{"findings": [{"name": 3}]}')
     with pytest.raises(CongraspError, match=r"check\.json is not a self-check"):
         main.run([*command, "--check", str(tmp_path / "check.json")])
