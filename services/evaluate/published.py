@@ -11,6 +11,8 @@ from congrasp.services.evaluate.scores import Row
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 FOLDER = pathlib.Path("docs", "results")
+HANDS_FOLDER = FOLDER / "hands"
+"""Records of hands of others (`hand_records`)."""
 _MAX_FILE_BYTES = 1 << 26
 _REQUIRED = (
     "command",
@@ -21,7 +23,7 @@ _REQUIRED = (
     "policies",
     "version",
 )
-"""Required content of a file in addition to its rows."""
+"""Required content of a file of `congrasp evaluate --json` in addition to its rows."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +32,7 @@ class Results:
 
     rows: Sequence[Row]
     about: Mapping[str, Any]
-    """Further content of the file from `congrasp evaluate --json`."""
+    """Further content of the file."""
 
     @property
     def policies(self) -> dict[str, str]:
@@ -38,8 +40,12 @@ class Results:
         return {policy["file"]: policy["sha256"] for policy in self.about["policies"]}
 
 
-def read_results(file: pathlib.Path) -> Results:
+def read_results(file: pathlib.Path, required: Sequence[str] = _REQUIRED) -> Results:
     """Reads the rows of a file and their provenance.
+
+    Args:
+      file: of `congrasp evaluate --json`, or of another command that writes rows.
+      required: names of required content.
 
     Raises:
       CongraspError: the file cannot be read, or another version of the project wrote it.
@@ -52,16 +58,20 @@ def read_results(file: pathlib.Path) -> Results:
         raise CongraspError(
             f"{file} is not a results file of this version of congrasp.", remedy
         ) from None
-    for name in _REQUIRED:
+    for name in required:
         if name not in about:
             raise CongraspError(f"{file} lacks '{name}'.", remedy)
     return Results(rows, about)
 
 
 def read_all_results(root: pathlib.Path = ROOT) -> dict[str, Results]:
-    """Reads all files of results, by their path in the folder without `.json`."""
+    """Reads all files of results, by their path in the folder without `.json`, except the records
+    of hands of others.
+    """
     results = {}
     for file in sorted((root / FOLDER).rglob("*.json")):
+        if file.is_relative_to(root / HANDS_FOLDER):
+            continue
         name = file.relative_to(root / FOLDER).with_suffix("").as_posix()
         results[name] = read_results(file)
     return results

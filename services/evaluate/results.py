@@ -3,7 +3,8 @@
 `congrasp evaluate … --json docs/results/NAME.json` writes a file. `python -m
 congrasp.services.evaluate.results` writes each table between `<!-- results NAME KIND -->` and `<!--
 end of results -->` in the README and in `docs`. KIND is one of `KINDS`, or `engines` for a table of
-the hand NAME in several engines (`engine_table`).
+the hand NAME in several engines (`engine_table`). The NAME `hands` is for the records of hands of
+others, and KIND is then one of `hand_tables.KINDS`.
 """
 
 import pathlib
@@ -11,7 +12,7 @@ import platform
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -21,6 +22,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.io.files import write_atomically
 from congrasp.common.runtime.engines import engine_title
 from congrasp.common.runtime.resources import cores
+from congrasp.services.evaluate import hand_tables
 from congrasp.services.evaluate.columns import (
     PLAUSIBILITY,
     SCORE_CELLS,
@@ -29,6 +31,7 @@ from congrasp.services.evaluate.columns import (
     row_title,
 )
 from congrasp.services.evaluate.engine_table import engine_table
+from congrasp.services.evaluate.hand_records import HandRecord, read_hand_records
 from congrasp.services.evaluate.heading_rules import HeadingRules
 from congrasp.services.evaluate.published import ROOT, Results, read_all_results
 from congrasp.services.evaluate.scores import Row
@@ -37,6 +40,8 @@ from congrasp.services.evaluate.text_table import Columns, Table, percent
 _BLOCK = re.compile(r"(<!-- results (\S+) (\S+) -->\n).*?(<!-- end of results -->)", re.S)
 _ENGINES = "engines"
 """Kind of the table of several files (`engine_table`)."""
+_HANDS = "hands"
+"""Name of the tables of the records of hands of others (`hand_tables`)."""
 
 
 def provenance(accelerators: str = "") -> dict[str, Any]:
@@ -136,15 +141,39 @@ KINDS: dict[str, Callable[[Results], list[str]]] = {
 """Tables of a file of results available to pages, as lines of Markdown."""
 
 
-def _table(kind: str, results: Mapping[str, Results], name: str) -> list[str]:
+def _kinds(results: Mapping[str, Results], name: str) -> Sequence[str]:
+    """Returns the kinds of tables of a name; none for a name without a file."""
+    if name == _HANDS:
+        return tuple(hand_tables.KINDS)
+    if name in results:
+        return (*KINDS, _ENGINES)
+    return ()
+
+
+def _table(
+    kind: str, name: str, results: Mapping[str, Results], hands: Sequence[HandRecord]
+) -> list[str]:
     """Returns the lines of a table."""
+    if name == _HANDS:
+        return hand_tables.KINDS[kind](hands)
     if kind == _ENGINES:
         return engine_table(results, name)
     return KINDS[kind](results[name])
 
 
-def fill_tables(page: str, results: Mapping[str, Results], name: str = "page") -> str:
+def fill_tables(
+    page: str,
+    results: Mapping[str, Results],
+    name: str = "page",
+    hands: Sequence[HandRecord] = (),
+) -> str:
     """Returns a page with its tables regenerated from results.
+
+    Args:
+      page: text of the page.
+      results: all results by their names.
+      name: name of the page in errors.
+      hands: records of hands of others.
 
     Raises:
       CongraspError: it names a file or a kind of table that does not exist.
@@ -153,12 +182,13 @@ def fill_tables(page: str, results: Mapping[str, Results], name: str = "page") -
     def block(match: re.Match[str]) -> str:
         """Returns one table between its markers."""
         opening, file, kind, closing = match.groups()
-        if file not in results or kind not in (*KINDS, _ENGINES):
+        if kind not in _kinds(results, file):
+            tables = (*KINDS, _ENGINES, *hand_tables.KINDS)
             raise CongraspError(
                 f"{name} names '{file} {kind}', which does not exist.",
-                f"Files: {', '.join(results)}; tables: {', '.join((*KINDS, _ENGINES))}.",
+                f"Files: {', '.join([*results, _HANDS])}; tables: {', '.join(tables)}.",
             )
-        return "\n".join([opening, *_table(kind, results, file), "", closing])
+        return "\n".join([opening, *_table(kind, file, results, hands), "", closing])
 
     return _BLOCK.sub(block, page)
 
@@ -166,9 +196,10 @@ def fill_tables(page: str, results: Mapping[str, Results], name: str = "page") -
 def pages(root: pathlib.Path = ROOT) -> Iterator[tuple[pathlib.Path, str]]:
     """Yields every page whose tables differ from the results, and its corrected text."""
     results = read_all_results(root)
+    hands = read_hand_records(root)
     for path in (root / "README.md", *sorted((root / "docs").rglob("*.md"))):
         text = path.read_text(encoding="utf-8")
-        corrected = fill_tables(text, results, path.name)
+        corrected = fill_tables(text, results, path.name, hands)
         if corrected != text:
             yield path, corrected
 

