@@ -8,6 +8,7 @@ simulated, the best of them becomes a motion, and the motion is written as files
 import dataclasses
 import json
 import pathlib
+import threading
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -32,6 +33,7 @@ from congrasp.services.grasp.progress import Progress
 from congrasp.services.grasp.result import Result
 from congrasp.services.viz.film import Film
 from congrasp.services.viz.import_sheet import import_sheet, mesh_of_file
+from congrasp.services.viz.raster import compile_loops
 from congrasp.services.viz.sheets import save_png
 from congrasp.services.viz.version import RENDERER_VERSION
 from congrasp.services.viz.views import View
@@ -53,6 +55,11 @@ class Settings(NamedTuple):
     """Repeats finished objects."""
     rest: str = ""
     """Resting pose: `upright` or a number from 1 on; any if empty."""
+
+    @property
+    def draws(self) -> bool:
+        """True if pictures or a video are drawn."""
+        return self.pictures or self.film is not None
 
     @property
     def drawn(self) -> list[Any]:
@@ -81,6 +88,9 @@ def grasp_object(
         facts = _facts_before(job)
         if facts is not None:
             return Result(entry.name, facts, skipped=True)
+        if settings.draws:
+            # It takes one core for seconds, as does the import after it, which waits for a process
+            threading.Thread(target=compile_loops).start()
         obj = _object_of(job, progress)
         request = _request_for(obj, grasper, job)
         _save_import_picture(job, grasper, obj, request, progress)

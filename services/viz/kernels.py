@@ -31,6 +31,10 @@ _SKY = 10
 _SHINE = 11
 _OPACITY = 12
 """Columns of `Mesh.values`, after position and normal."""
+_LIFT_SAMPLES = 1.5
+"""Height above the surface at which its light is looked up, in samples of the shadow map."""
+_LEAST_LIGHT = 1e-6
+"""Prevents a division by zero where no lamp faces a surface."""
 
 
 class Mesh(NamedTuple):
@@ -47,6 +51,17 @@ class Mesh(NamedTuple):
     highlight, opacity."""
     chart: np.ndarray
     """(F,) chart of a texture that replaces the colour, or `NOTHING`."""
+
+
+class Bodies(NamedTuple):
+    """F triangles between V points that cast shadows."""
+
+    points: np.ndarray
+    """(V, 3)."""
+    faces: np.ndarray
+    """(F, 3) the triangles."""
+    closed: np.ndarray
+    """(F,) bool, see `cover`."""
 
 
 def linear(colour: np.ndarray) -> np.ndarray:
@@ -160,17 +175,32 @@ def _dot(a: Sequence[float] | np.ndarray, b: Sequence[float] | np.ndarray) -> fl
 
 
 @_compiled
-def _interpolate(mesh: Mesh, face: int, column: int, row: int, here: np.ndarray) -> None:
-    """Writes the values of a triangle at a sample into `here`, in perspective."""
+def _planes(mesh: Mesh, face: int, planes: np.ndarray) -> None:
+    """Writes a, b and c of the values of a triangle as a column + b row + c, all divided by the
+    depth, and those of one over the depth after them, into `planes` (3, n + 1).
+    """
     i, j, k = mesh.faces[face]
-    first, second, third = _at(_weights(mesh.corners, i, j, k)[1], column, row)
-    first *= mesh.nearness[i]
-    second *= mesh.nearness[j]
-    third *= mesh.nearness[k]
-    depth = 1 / (first + second + third)
-    for n in range(len(here)):
-        total = first * mesh.values[i, n] + second * mesh.values[j, n] + third * mesh.values[k, n]
-        here[n] = depth * total
+    near = mesh.nearness[i], mesh.nearness[j], mesh.nearness[k]
+    first, second = _weights(mesh.corners, i, j, k)[1]
+    for term in range(3):
+        one = 1.0 if term == 2 else 0.0
+        at_i = near[0] * first[term]
+        at_j = near[1] * second[term]
+        at_k = near[2] * (one - first[term] - second[term])
+        planes[term, -1] = at_i + at_j + at_k
+        for n in range(mesh.values.shape[1]):
+            planes[term, n] = (
+                at_i * mesh.values[i, n] + at_j * mesh.values[j, n] + at_k * mesh.values[k, n]
+            )
+
+
+@_compiled
+def _interpolate(planes: np.ndarray, column: int, row: int, here: np.ndarray) -> None:
+    """Writes the values of a triangle (`_planes`) at a sample into `here`, in perspective."""
+    last = len(here)
+    depth = 1 / (planes[0, last] * column + planes[1, last] * row + planes[2, last])
+    for n in range(last):
+        here[n] = depth * (planes[0, n] * column + planes[1, n] * row + planes[2, n])
 
 
 @_compiled
@@ -210,6 +240,8 @@ def _light(here: np.ndarray, eye: np.ndarray, key: np.ndarray) -> tuple[float, f
         + _SKY_STRENGTH * here[_SKY] * (0.6 + 0.4 * normal[2] / length)
         + _AMBIENT_STRENGTH
     )
+    if here[_SHINE] == 0:
+        return light, 0.0
     mirrored = max(_dot(normal, half) / length / np.sqrt(_dot(half, half)), 0.0)
     gloss = here[_SHINE] * here[_LIGHT] * mirrored**_HIGHLIGHT_EXPONENT
     return light, gloss
@@ -239,12 +271,17 @@ def shade(
       image: (height, width, 3) sRGB; changed in place.
     """
     here = np.empty(mesh.values.shape[1])
+    planes = np.empty((3, len(here) + 1))
+    known = NOTHING
     for row in range(owner.shape[0]):
         for column in range(owner.shape[1]):
             face = owner[row, column]
             if face == NOTHING:
                 continue
-            _interpolate(mesh, face, column, row, here)
+            if face != known:
+                _planes(mesh, face, planes)
+                known = face
+            _interpolate(planes, column, row, here)
             if mesh.chart[face] != NOTHING:
                 _look_up(texture, mesh.chart[face], here)
             light, gloss = _light(here, eye, key)
@@ -256,54 +293,129 @@ def shade(
 
 
 @_compiled
-def add_light(
-    points: np.ndarray,
-    strength: np.ndarray,
-    axes: np.ndarray,
-    origin: np.ndarray,
-    sample: float,
-    top: np.ndarray,
-    total: np.ndarray,
-) -> None:
-    """Adds the light of a distant lamp to points that no body shadows (a shadow map).
-
-    The four samples of the lamp's picture around a point are compared with it and interpolated
-    bilinearly, so that the edge of a shadow is one sample wide.
+def _lamp_picture(
+    axes: np.ndarray, bodies: Bodies, top: np.ndarray, owner: np.ndarray
+) -> tuple[float, float, float]:
+    """Draws the heights of bodies as a distant lamp sees them (a shadow map).
 
     Args:
-      points: (n, 3).
-      strength: (n,) light of the lamp without shadow.
       axes: (3, 3) rows: the lamp's right, up, and the direction towards it.
-      origin: (3,) along these: of the first sample of the lamp's picture, and the bias added to a
-        point's height.
-      sample: size of a sample, m.
-      top: (height, width) height of the body nearest to the lamp.
-      total: (n,) light; changed in place.
+      bodies: the bodies.
+      top: (grid, grid) height of the body nearest to the lamp; overwritten.
+      owner: (grid, grid) its triangle; overwritten.
+
+    Returns:
+      Place of the first sample along right and up, and the size of a sample, m.
     """
-    for n in range(len(points)):
-        x = min(max((_dot(axes[0], points[n]) - origin[0]) / sample, 0.0), top.shape[1] - 1.001)
-        y = min(max((origin[1] - _dot(axes[1], points[n])) / sample, 0.0), top.shape[0] - 1.001)
-        height = _dot(axes[2], points[n]) + origin[2]
-        left = int(x)
-        above = int(y)
-        share = 0.0
-        for j in range(2):
-            for i in range(2):
-                if top[above + j, left + i] <= height:
-                    across = x - left if i else 1 - x + left
-                    down = y - above if j else 1 - y + above
-                    share += across * down
-        total[n] += share * strength[n]
+    # Loops: the functions of NumPy would take seconds to compile
+    corners = np.empty((len(bodies.points), 2))
+    height = np.empty(len(bodies.points))
+    left = right = lower = upper = 0.0
+    for n in range(len(bodies.points)):
+        x = _dot(axes[0], bodies.points[n])
+        y = _dot(axes[1], bodies.points[n])
+        if n == 0:
+            left = right = x
+            upper = lower = y
+        left = min(left, x)
+        right = max(right, x)
+        lower = min(lower, y)
+        upper = max(upper, y)
+        corners[n, 0] = x
+        corners[n, 1] = y
+        height[n] = _dot(axes[2], bodies.points[n])
+    # One empty sample on each side, so that points beyond the map are lit.
+    sample = max(right - left, upper - lower) / (len(top) - 3)
+    left -= sample
+    upper += sample
+    for n in range(len(corners)):
+        corners[n, 0] = (corners[n, 0] - left) / sample
+        corners[n, 1] = (upper - corners[n, 1]) / sample
+    for row in range(top.shape[0]):
+        for column in range(top.shape[1]):
+            top[row, column] = -np.inf
+    cover(corners, height, bodies.faces, bodies.closed, top, owner)
+    return left, upper, sample
 
 
 @_compiled
-def _mean(image: np.ndarray, row: int, column: int, channel: int, samples: int) -> float:
-    """Mean of a square of samples from a row and a column on."""
-    total = 0.0
-    for y in range(row, row + samples):
-        for x in range(column, column + samples):
-            total += image[y, x, channel]
-    return total / samples**2
+def _unshadowed(top: np.ndarray, x: float, y: float, height: float) -> float:
+    """Share of a lamp's light at a height and a place in its picture, in samples; one beyond it.
+
+    The four samples around the place are compared with the height and interpolated bilinearly, so
+    that the edge of a shadow is one sample wide.
+    """
+    if not (0 <= x < top.shape[1] - 1 and 0 <= y < top.shape[0] - 1):
+        return 1.0
+    left = int(x)
+    above = int(y)
+    share = 0.0
+    for j in range(2):
+        for i in range(2):
+            if top[above + j, left + i] <= height:
+                across = x - left if i else 1 - x + left
+                down = y - above if j else 1 - y + above
+                share += across * down
+    return share
+
+
+@_compiled
+def light_of(
+    lamps: np.ndarray,
+    facing: tuple[float, float],
+    points: np.ndarray,
+    normals: np.ndarray,
+    bodies: Bodies,
+    grid: int,
+) -> np.ndarray:
+    """(n,) share of the light of distant lamps that reaches points past the bodies, from 0 to 1.
+
+    Args:
+      lamps: (L, 3, 3) rows of each: the lamp's right, up, and the direction towards it.
+      facing: a and b of the strength a cos + b of a lamp's light, with the cosine between the
+        surface's normal and the lamp; none if it is negative.
+      points: (n, 3).
+      normals: (n, 3) of the surfaces there.
+      bodies: bodies that cast shadows.
+      grid: samples along each side of a shadow map.
+    """
+    count = len(points)
+    light = np.zeros(count)
+    total = np.zeros(count)
+    top = np.empty((grid, grid), np.float32)
+    owner = np.empty((grid, grid), np.int32)
+    for axes in lamps:
+        left, upper, sample = _lamp_picture(axes, bodies, top, owner)
+        lift = np.float32(_LIFT_SAMPLES * sample)
+        for n in range(count):
+            strength = facing[0] * _dot(axes[2], normals[n]) + facing[1]
+            if strength <= 0:
+                continue
+            lifted = (
+                points[n, 0] + lift * normals[n, 0],
+                points[n, 1] + lift * normals[n, 1],
+                points[n, 2] + lift * normals[n, 2],
+            )
+            x = (_dot(axes[0], lifted) - left) / sample
+            y = (upper - _dot(axes[1], lifted)) / sample
+            height = _dot(axes[2], lifted) + sample
+            light[n] += strength * _unshadowed(top, x, y, height)
+            total[n] += strength
+    for n in range(count):
+        light[n] /= max(total[n], _LEAST_LIGHT)
+    return light
+
+
+@_compiled
+def repeated(image: np.ndarray, samples: int) -> np.ndarray:
+    """(h * samples, w * samples, C) of an image (h, w, C): each pixel as a square of samples."""
+    height, width, channels = image.shape
+    finer = np.empty((height * samples, width * samples, channels), image.dtype)
+    for row in range(height * samples):
+        for column in range(width * samples):
+            for channel in range(channels):
+                finer[row, column, channel] = image[row // samples, column // samples, channel]
+    return finer
 
 
 @_compiled
@@ -312,9 +424,13 @@ def averaged(image: np.ndarray, samples: int) -> np.ndarray:
     height = image.shape[0] // samples
     width = image.shape[1] // samples
     picture = np.empty((height, width, 3), np.uint8)
+    share = 255 / (samples * samples)
     for row in range(height):
         for column in range(width):
             for channel in range(3):
-                mean = _mean(image, row * samples, column * samples, channel, samples)
-                picture[row, column, channel] = int(255 * min(max(mean, 0.0), 1.0) + 0.5)
+                total = 0.0
+                for y in range(samples * row, samples * (row + 1)):
+                    for x in range(samples * column, samples * (column + 1)):
+                        total += image[y, x, channel]
+                picture[row, column, channel] = int(min(max(share * total, 0.0), 255.0) + 0.5)
     return picture

@@ -4,13 +4,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from congrasp.services.viz.kernels import add_light, cover
+from congrasp.services.viz.kernels import Bodies, light_of
 from congrasp.services.viz.triangles import Triangles
 
 _KEY_RADIUS = 0.12
 """Radius of the key light at a distance of one."""
-_LIFT_SAMPLES = 1.5
-"""Height above the surface at which its light is looked up, in samples of the shadow map."""
+_KEY_FACING = (0.0, 1.0)
+_SKY_FACING = (0.75, 0.25)
+"""Strength of their lamps, see `light_of`; a lamp of the sky represents a patch of it."""
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 _LOWEST_SKY = 0.08
 """Height of the lowest lamps of the sky, as the sine of their elevation."""
@@ -50,57 +51,21 @@ def light_on(
     Returns:
       (n, 2) key light and sky, from 0 to 1.
     """
-    count = len(points)
-    light = np.zeros((2, count))
-    even = np.full(count, 1 / lamps.key)
-    for lamp in _disc(key, lamps.key, _KEY_RADIUS):
-        light[0] += _lamp_light(lamp, lamps.grid, even, points, normals, bodies)
-    unshadowed = np.full(count, 1e-6)
-    for lamp in _dome(lamps.sky):
-        # A lamp represents a patch of the sky
-        facing = np.clip(0.75 * (normals @ lamp) + 0.25, 0, None)
-        light[1] += _lamp_light(lamp, lamps.grid, facing, points, normals, bodies)
-        unshadowed += facing
-    light[1] /= unshadowed
-    return light.T
-
-
-def _lamp_light(
-    lamp: np.ndarray,
-    grid: int,
-    strength: np.ndarray,
-    points: np.ndarray,
-    normals: np.ndarray,
-    bodies: Triangles,
-) -> np.ndarray:
-    """(n,) light of a distant lamp on points (n, 3).
-
-    Args:
-      lamp: (3,) unit direction towards the lamp.
-      grid: samples along each side of its shadow map.
-      strength: (n,) its light without shadow.
-      points: (n, 3).
-      normals: (n, 3) of the surfaces there.
-      bodies: bodies that cast shadows.
-    """
     if not len(bodies.faces):
-        return strength
-    right = np.cross(lamp, [1.0, 0.0, 0.0])
-    right = right / np.linalg.norm(right)
-    axes = np.stack([right, np.cross(lamp, right), lamp])  # right, up, towards the lamp
-    x, y, height = axes @ bodies.points.T
-    sample = max(np.ptp(x), np.ptp(y)) / (grid - 3)
-    # One empty sample on each side, so that points beyond the map are lit.
-    left = x.min() - sample
-    upper = y.max() + sample
-    top = np.full((grid, grid), -np.inf, np.float32)
-    owner = np.empty((grid, grid), np.int32)
-    corners = np.stack([x - left, upper - y], -1) / sample
-    cover(corners, height, bodies.faces, bodies.closed, top, owner)
-    lifted = points + np.float32(_LIFT_SAMPLES * sample) * normals
-    light = np.zeros(len(points))
-    add_light(lifted, strength, axes, np.array([left, upper, sample]), sample, top, light)
-    return light
+        return np.ones((len(points), 2))
+    casting = Bodies(bodies.points, bodies.faces, bodies.closed)
+    disc = _axes(_disc(key, lamps.key, _KEY_RADIUS))
+    dome = _axes(_dome(lamps.sky))
+    from_key = light_of(disc, _KEY_FACING, points, normals, casting, lamps.grid)
+    from_sky = light_of(dome, _SKY_FACING, points, normals, casting, lamps.grid)
+    return np.stack([from_key, from_sky], axis=-1)
+
+
+def _axes(lamps: np.ndarray) -> np.ndarray:
+    """(L, 3, 3) rows: right and up of lamps, and the unit directions (L, 3) towards them."""
+    right = np.cross(lamps, [1.0, 0.0, 0.0])
+    right = right / np.linalg.norm(right, axis=1, keepdims=True)
+    return np.stack([right, np.cross(lamps, right), lamps], axis=1)
 
 
 def _disc(direction: np.ndarray, count: int, radius: float) -> np.ndarray:

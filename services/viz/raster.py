@@ -1,13 +1,15 @@
 """Pictures of shapes without OpenGL, EGL or a display: triangles into a depth buffer."""
 
+import functools
 from collections.abc import Sequence
 
 import numpy as np
 
+from congrasp.services.appearance.palette import OBJECT
 from congrasp.services.viz.camera import Camera, fit
-from congrasp.services.viz.kernels import NOTHING, Mesh, averaged, cover, shade
+from congrasp.services.viz.kernels import NOTHING, Mesh, averaged, cover, repeated, shade
 from congrasp.services.viz.lighting import FEW, MANY, ON_TABLE, light_on
-from congrasp.services.viz.shapes import Shape, points_of
+from congrasp.services.viz.shapes import Shape, points_of, table_shape
 from congrasp.services.viz.triangles import Triangles, joined, triangles_of
 
 SAMPLES = 2
@@ -16,6 +18,10 @@ _NEAREST_M = 0.01
 """Depth from which a camera sees."""
 _LARGE_PICTURE = 500_000
 """Pixels from which a picture is large."""
+_BALL_RADIUS_M = 0.05
+_BALL_VIEW = (1.0, 0.0, 1.0)
+_BALL_SIZE = (8, 6)
+"""Picture by which the loops are compiled."""
 _BACKGROUND_TOP = np.array([0.93, 0.945, 0.965], np.float32)
 _BACKGROUND_BOTTOM = np.array([0.80, 0.82, 0.85], np.float32)
 """Colours of the background, sRGB."""
@@ -74,6 +80,17 @@ def render_fitted(
     return render_scene([*shapes, *around], camera, size)
 
 
+@functools.cache
+def compile_loops() -> None:
+    """Compiles the loops of the renderer, or loads them from the cache, by a picture of a ball on a
+    table.
+
+    The first call in a process takes seconds if the cache is empty.
+    """
+    ball = Shape("sphere", (_BALL_RADIUS_M, 0.0), OBJECT)
+    render_fitted([ball], _BALL_VIEW, _BALL_SIZE, around=[table_shape(np.zeros(3))])
+
+
 def visible(shapes: Sequence[Shape], camera: Camera, size: tuple[int, int]) -> np.ndarray:
     """(height, width) index of the solid shape that each pixel shows, -1 for the background."""
     solid = [i for i, shape in enumerate(shapes) if shape.alpha >= 1]
@@ -115,8 +132,8 @@ class _Picture:
 
     def finer(self) -> "_Picture":
         """Returns the same picture with more samples."""
-        image = self.image.repeat(SAMPLES, 0).repeat(SAMPLES, 1)
-        nearness = self._nearness.repeat(SAMPLES, 0).repeat(SAMPLES, 1)
+        image = repeated(self.image, SAMPLES)
+        nearness = repeated(self._nearness[..., None], SAMPLES)[..., 0]
         return _Picture(self._camera, image, nearness)
 
     def add(self, triangles: Triangles, light: np.ndarray, alpha: float = 1.0) -> None:
