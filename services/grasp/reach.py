@@ -153,7 +153,10 @@ def plan_reach(  # noqa: PLR0913
     relaxed = hand.q_open + _RELAXED * (hand.q_closed - hand.q_open)
     fingers = np.stack([relaxed, first.q[0]])
     axes = axes_in_wrist(hand, (1 - checked[:, None]) * fingers[0] + checked[:, None] * fingers[1])
-    end = clearances(hand, field, rest, axes[-1:], first)[:, 0]
+    # As many poses as a curve has: another number would be compiled again
+    every = np.zeros(_CHECKED, int)
+    ends = Reach(first.position[every], first.rotation[every], first.q[every])
+    end = clearances(hand, field, rest, axes[-1:][every], ends)[:, 0]
     lowest = (
         _first_turn(hand, np.array([1.0, 0.0, 0.0]), side).apply(axes[0])[:, 2] - _radii(hand)
     ).min()
@@ -262,6 +265,9 @@ def _radii(hand: Hand) -> np.ndarray:
     return np.repeat(hand.capsule_radii, _ALONG)
 
 
+_nearest_angles = jax.jit(rotations.quaternion_to_euler)
+
+
 @jax.jit
 def _at(field: DistanceField, points: np.ndarray) -> jax.Array:
     """(n,) signed distances of points (n, 3) of the object frame, in one program."""
@@ -357,16 +363,13 @@ def _wrist_joints(episode: Episode, reach: Reach) -> np.ndarray:
     step.
     """
     first = episode.require_recorded().wrist_joints[0].astype(float)
-    turn = Rotation.from_quat(
-        np.asarray(rotations.euler_to_quaternion(first[3:])), scalar_first=True
-    )
+    turn = Rotation.from_euler("XYZ", first[3:])
     base = Rotation.from_quat(episode.wrist_quaternion[0], scalar_first=True) * turn.inv()
     origin = episode.wrist_position[0] - base.apply(first[:3])
     turned = (base.inv() * reach.rotation).as_quat(scalar_first=True)
     hinges = np.zeros((len(turned), 3))
     near = first[3:]
     for i in reversed(range(len(turned))):  # from the grasp backwards, so that no angle jumps
-        angles = np.asarray(rotations.quaternion_to_euler(turned[i : i + 1], near[None]))
-        hinges[i] = angles[0]
+        hinges[i] = _nearest_angles(turned[i], near)
         near = hinges[i]
     return np.concatenate([base.inv().apply(reach.position - origin), hinges], 1)
