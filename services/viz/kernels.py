@@ -176,17 +176,19 @@ def _dot(a: Sequence[float] | np.ndarray, b: Sequence[float] | np.ndarray) -> fl
 
 @_compiled
 def _planes(mesh: Mesh, face: int, planes: np.ndarray) -> None:
-    """Writes a, b and c of the values of a triangle as a column + b row + c, all divided by the
-    depth, and those of one over the depth after them, into `planes` (3, n + 1).
+    """Writes the coefficients of a triangle's n values over depth, and then of one over depth.
+
+    Both are linear over the picture: a column + b row + c, with a, b and c the rows of `planes`
+    (3, n + 1).
     """
     i, j, k = mesh.faces[face]
     near = mesh.nearness[i], mesh.nearness[j], mesh.nearness[k]
     first, second = _weights(mesh.corners, i, j, k)[1]
     for term in range(3):
-        one = 1.0 if term == 2 else 0.0
+        whole = 1.0 if term == 2 else 0.0
         at_i = near[0] * first[term]
         at_j = near[1] * second[term]
-        at_k = near[2] * (one - first[term] - second[term])
+        at_k = near[2] * (whole - first[term] - second[term])
         planes[term, -1] = at_i + at_j + at_k
         for n in range(mesh.values.shape[1]):
             planes[term, n] = (
@@ -310,13 +312,13 @@ def _lamp_picture(
     # Loops: the functions of NumPy would take seconds to compile
     corners = np.empty((len(bodies.points), 2))
     height = np.empty(len(bodies.points))
-    left = right = lower = upper = 0.0
+    left = np.inf
+    right = -np.inf
+    lower = np.inf
+    upper = -np.inf
     for n in range(len(bodies.points)):
         x = _dot(axes[0], bodies.points[n])
         y = _dot(axes[1], bodies.points[n])
-        if n == 0:
-            left = right = x
-            upper = lower = y
         left = min(left, x)
         right = max(right, x)
         lower = min(lower, y)

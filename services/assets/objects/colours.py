@@ -11,6 +11,7 @@ from trimesh.visual.color import uv_to_interpolated_color
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects.spec import COLOUR_POINTS, Colours
+from congrasp.common.runtime.resources import cores
 from congrasp.services.assets.objects.mesh_files import load_geometry, up_of, upright
 from congrasp.services.assets.objects.options import Up
 
@@ -100,7 +101,8 @@ def _sample_meshes(meshes: list[trimesh.Trimesh], rng: np.random.Generator) -> C
 
 def _changes(dense: Colours) -> np.ndarray:
     """(n,) largest difference of a point's colour to those of its nearest points, 0 to 255."""
-    nearest = cKDTree(dense.points).query(dense.points, k=_NEIGHBOURS)[1]
+    tree = cKDTree(dense.points)
+    nearest = tree.query(dense.points, k=_NEIGHBOURS, workers=cores())[1]
     values = dense.values.astype(np.int16)
     return np.abs(values[nearest] - values[:, None]).max(axis=(1, 2)).astype(float)
 

@@ -21,13 +21,14 @@ from congrasp.services.appearance.palette import FLESH
 from congrasp.services.cli.main import load
 from congrasp.services.record.reader import pick_episode
 from congrasp.services.record.writer import Entry, LogWriter, opaque_channel
+from congrasp.services.viz import kernels
 from congrasp.services.viz.camera import Camera, fit
 from congrasp.services.viz.camera_path import following_cameras
 from congrasp.services.viz.episode_scene import TOUCHING, episode_shapes
 from congrasp.services.viz.film import Film, save_episode_video
 from congrasp.services.viz.hand_shapes import capsule_shapes, skin_colours
 from congrasp.services.viz.hand_sheets import hand_sheet
-from congrasp.services.viz.raster import render_scene, visible
+from congrasp.services.viz.raster import compile_loops, render_scene, visible
 from congrasp.services.viz.render import (
     episode_sheet,
     episode_title,
@@ -459,6 +460,15 @@ def test_a_video_runs_in_real_time_to_its_last_step_and_shows_no_overlays(tmp_pa
     marked = episode_shapes(episode(), 11)
     assert len(bare) == 3
     assert len(marked) > 3
+
+
+def test_a_small_picture_compiles_all_loops() -> None:
+    compile_loops()
+    record = episode()
+    camera = camera_of(record, [0], overlays=True)
+    render_scene(episode_shapes(record, 0), camera, (40, 30))
+    for name in ("cover", "light_of", "shade", "repeated", "averaged"):
+        assert len(getattr(kernels, name).signatures) == 1, name
 
 
 def test_pictures_need_no_writable_folder() -> None:
