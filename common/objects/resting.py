@@ -1,5 +1,6 @@
 """Stable poses of an object on a table: computed from its convex hull, then settled by physics."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -120,18 +121,25 @@ def settle(obj: GraspObject, pose: np.ndarray, seconds: float) -> Settled:
     return TableScene(obj).settle(pose, seconds)
 
 
-def rest_poses(obj: GraspObject) -> np.ndarray:
+def rest_poses(
+    obj: GraspObject, on_candidate: Callable[[int, int], None] = lambda done, total: None
+) -> np.ndarray:
     """Poses (R, 7), 1 <= R <= 8, in which the object rests on the table, most likely first.
 
     Physics settles the quasi-static poses for 0.25 s, or a few times as long if needed. Poses are
     dropped if they do not come to rest, if a small tilt would lower them, or if they end in an
     earlier pose. If none remains, the most likely one is simulated until the object rests.
+
+    Args:
+      obj: the object.
+      on_candidate: called with the number of poses that are settled, and that of all.
     """
     candidates, _ = quasi_static_poses(obj.pieces)
     scene = TableScene(obj)
     stable: list[np.ndarray] = []
     downs: list[np.ndarray] = []
-    for candidate in candidates:
+    for number, candidate in enumerate(candidates):
+        on_candidate(number, len(candidates))
         pose = candidate
         for _ in range(_MAX_ROUNDS):
             settled = scene.settle(pose, _SETTLING_S, overdamped=True)

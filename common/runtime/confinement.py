@@ -10,7 +10,8 @@ import logging
 import pathlib
 import subprocess
 import threading
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import psutil
@@ -21,6 +22,8 @@ Excess = Literal["", "memory", "time", "file", "killed"]
 """Limit that a child has exceeded; `killed` if the system killed it, as it does without memory."""
 _LOOK_S = 0.05
 """Time between two looks at a watched child."""
+_WAIT_S = 0.5
+"""Time between two calls while a child runs."""
 _log = logging.getLogger(__name__)
 
 
@@ -56,6 +59,7 @@ def run_confined(
     environment: Mapping[str, str],
     stream: Literal["stdout", "stderr"],
     data: bytes = b"",
+    on_wait: Callable[[], None] = lambda: None,
 ) -> Ending:
     """Runs a child process until it ends or exceeds a limit.
 
@@ -65,6 +69,7 @@ def run_confined(
       environment: its environment.
       stream: stream that is captured; the other one is discarded.
       data: its standard input.
+      on_wait: called twice a second while the child runs; what it raises ends the child.
 
     Raises:
       TimeoutError: it did not end within `patience_s`.
@@ -79,13 +84,35 @@ def run_confined(
             _report_watching()
             _watch(child, limits, excess)
         try:
-            outputs = child.communicate(data, limits.patience_s)
-        except subprocess.TimeoutExpired:
-            raise TimeoutError from None
+            outputs = _communicate(child, data, limits.patience_s, on_wait)
         finally:
             child.kill()
     output = outputs[0] if stream == "stdout" else outputs[1]
     return Ending(child.returncode, output, excess[0] if excess else _excess_of(child.returncode))
+
+
+def _communicate(
+    child: subprocess.Popen[bytes], data: bytes, patience: float, on_wait: Callable[[], None]
+) -> tuple[bytes, bytes]:
+    """Sends a child its input and returns its standard output and error.
+
+    Args:
+      child: the child.
+      data: its standard input.
+      patience: time until a TimeoutError, s.
+      on_wait: called while the child runs.
+    """
+    deadline = time.monotonic() + patience
+    remaining_data: bytes | None = data
+    while True:
+        remaining_s = max(0.0, deadline - time.monotonic())
+        try:
+            return child.communicate(remaining_data, min(_WAIT_S, remaining_s))
+        except subprocess.TimeoutExpired:
+            if time.monotonic() >= deadline:
+                raise TimeoutError from None
+        remaining_data = None  # the first call keeps what it has not sent
+        on_wait()
 
 
 @functools.cache

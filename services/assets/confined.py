@@ -47,11 +47,10 @@ def call_confined(
     function: Callable[..., Any],
     folder: pathlib.Path,
     options: dict[str, Any],
+    limits: Limits,
     *,
-    memory: int,
-    seconds: float,
-    patience: float,
     packages: Sequence[str] = (),
+    on_wait: Callable[[], None] = lambda: None,
 ) -> Any:
     """Calls a function of a module in a child process.
 
@@ -63,22 +62,22 @@ def call_confined(
       function: called as function(folder, **options); returns what JSON takes.
       folder: an empty folder, or one with arrays for the function; it may write others.
       options: further arguments, as JSON takes them.
-      memory: limit of the address space, bytes.
-      seconds: limit of the processor time, s.
-      patience: limit of the wall-clock time, s.
+      limits: limits of the child.
       packages: packages that the function uses, imported before it is called.
+      on_wait: called twice a second while the child runs; what it raises ends the child.
 
     Raises:
       CongraspError: of the function.
-      TimeoutError: it did not end within `patience`.
+      TimeoutError: it did not end within the limit of wall-clock time.
       OutOfResources: it reached its limit of processor time or memory, or the system killed it.
       EnvironmentFailure: it did not start, or failed for a reason that is not the function's.
       ChildProcessError: it ended without an answer.
     """
     env = child_environment(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", JAX_PLATFORMS="cpu")
     called = f"{function.__module__}:{function.__name__}"
+    memory = limits.memory
+    seconds = limits.processor_s
     arguments = [called, str(folder), str(memory), str(seconds), str(os.getpid()), *packages]
-    limits = Limits(memory=memory, processor_s=seconds, patience_s=patience)
     try:
         child = run_confined(
             [sys.executable, "-P", "-m", _MODULE, *arguments],
@@ -86,6 +85,7 @@ def call_confined(
             env,
             stream="stderr",
             data=json.dumps(options).encode(),
+            on_wait=on_wait,
         )
     except TimeoutError:  # which is an OSError, too
         raise

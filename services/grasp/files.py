@@ -10,6 +10,7 @@ import numpy as np
 
 from congrasp.common.episode.motion_file import save_motion
 from congrasp.common.io.files import write_atomically
+from congrasp.common.runtime.progress import Progress, ignore_progress
 from congrasp.services.grasp.arm_files import (
     ARM_PICTURE,
     save_robot_picture,
@@ -17,7 +18,6 @@ from congrasp.services.grasp.arm_files import (
     save_trajectories,
 )
 from congrasp.services.grasp.motion import Grasp
-from congrasp.services.grasp.progress import Progress, ignore_progress
 from congrasp.services.record.episode_file import save_episode
 from congrasp.services.viz.film import Film, save_episode_video
 from congrasp.services.viz.render import (

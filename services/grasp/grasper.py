@@ -21,6 +21,7 @@ from congrasp.common.policy.bundle import PolicyBundle
 from congrasp.common.request import GraspRequest
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.entry import compiling_entry
+from congrasp.common.runtime.progress import Progress, ignore_progress
 from congrasp.common.runtime.resources import cores
 from congrasp.common.task.constraints import require_known
 from congrasp.common.task.constraints.priority import contradictions, explain
@@ -30,7 +31,6 @@ from congrasp.services.client.left_policy import mirrored_request
 from congrasp.services.grasp.approaches import prescribed_path, surface_of, to_attempt, with_avoid
 from congrasp.services.grasp.costs import costs, rest_ranks
 from congrasp.services.grasp.motion import Grasp
-from congrasp.services.grasp.progress import Progress, ignore_progress
 from congrasp.services.grasp.reach import NoReachError, with_planned_reach
 
 if TYPE_CHECKING:

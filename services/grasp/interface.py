@@ -13,13 +13,13 @@ from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file
 from congrasp.common.runtime.engines import PhysicsName
 from congrasp.common.runtime.entry import compiling_entry
+from congrasp.common.runtime.progress import Progress, ignore_progress
 from congrasp.services.arm import ArmOptions
 from congrasp.services.assets.objects.named import one_object
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.grasp.grasper import ATTEMPTS, Grasper
 from congrasp.services.grasp.motion import Grasp
 from congrasp.services.grasp.parse import read_request
-from congrasp.services.grasp.progress import Progress, ignore_progress
 
 
 @compiling_entry

@@ -20,6 +20,7 @@ from congrasp.common.io.spelling import check_spelling
 from congrasp.common.objects.resting import upright_rest
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.request import GraspRequest
+from congrasp.common.runtime.progress import Progress, ignore_progress
 from congrasp.services.assets.objects.masses import with_mass
 from congrasp.services.assets.objects.named import ObjectAt, located, objects_at
 from congrasp.services.assets.objects.options import ImportOptions, check_options
@@ -29,7 +30,6 @@ from congrasp.services.grasp.grasper import Grasper
 from congrasp.services.grasp.keys import identity_of_constraints, identity_of_options, key_of
 from congrasp.services.grasp.motion import Grasp
 from congrasp.services.grasp.parse import read_request
-from congrasp.services.grasp.progress import Progress
 from congrasp.services.grasp.result import Result
 from congrasp.services.viz.film import Film
 from congrasp.services.viz.import_sheet import import_sheet, mesh_of_file
@@ -120,7 +120,9 @@ def find_objects(
     return [entry._replace(name=name) for entry, name in zip(entries, names, strict=True)], errors
 
 
-def import_object(entry: ObjectAt, options: ImportOptions) -> GraspObject:
+def import_object(
+    entry: ObjectAt, options: ImportOptions, progress: Progress = ignore_progress
+) -> GraspObject:
     """Loads an object; only scale and mass of the options apply to object files and generated
     objects.
 
@@ -129,7 +131,7 @@ def import_object(entry: ObjectAt, options: ImportOptions) -> GraspObject:
     """
     check_options(options)
     if entry.source:
-        return entry.load(options)
+        return entry.load(options, progress)
     return with_mass(entry.load().scaled(options.scale), options.mass, options.material)
 
 
@@ -190,7 +192,7 @@ def _facts_before(job: _Job) -> dict[str, Any] | None:
 def _object_of(job: _Job, progress: Progress) -> GraspObject:
     """Step 1: the object of a job."""
     progress("Importing", 0, 0)
-    return import_object(job.entry, job.settings.options)
+    return import_object(job.entry, job.settings.options, progress)
 
 
 def _request_for(obj: GraspObject, grasper: Grasper, job: _Job) -> GraspRequest:

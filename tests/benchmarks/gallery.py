@@ -14,11 +14,11 @@ from congrasp.common.episode.episode import Episode
 from congrasp.common.errors import CongraspError
 from congrasp.common.policy import bundle as bundles
 from congrasp.common.policy.pretrained import policy_file
+from congrasp.common.runtime.progress import ignore_progress
 from congrasp.services.assets.objects.options import ImportOptions
 from congrasp.services.grasp.files import RECORDING
 from congrasp.services.grasp.grasper import Grasper
 from congrasp.services.grasp.jobs import Settings, find_objects, grasp_object
-from congrasp.services.grasp.progress import ignore_progress
 from congrasp.services.grasp.result import Result
 from congrasp.services.record.reader import pick_episode
 from congrasp.services.viz.film import Film, film_frames

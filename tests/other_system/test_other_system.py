@@ -114,6 +114,7 @@ def test_files_and_workers(tmp_path):
 
 CONFINED = """
 import json, logging, pathlib, sys, tempfile, time
+from congrasp.common.runtime.confinement import Limits
 from congrasp.services.assets.confined import OutOfResources, call_confined
 from tests.other_system import greedy
 
@@ -122,12 +123,11 @@ handler = logging.Handler()
 handler.emit = records.append
 logging.getLogger("congrasp").addHandler(handler)
 logging.getLogger("congrasp").setLevel("INFO")
+limits = Limits(memory=300 << 20, processor_s=2.0, patience_s=50.0)
 for function in (greedy.allocate, greedy.compute):
     began = time.monotonic()
     try:
-        call_confined(
-            function, pathlib.Path(tempfile.mkdtemp()), {}, memory=300 << 20, seconds=2.0, patience=50.0
-        )
+        call_confined(function, pathlib.Path(tempfile.mkdtemp()), {}, limits)
     except OutOfResources as error:
         print(error)
 print(len(records))

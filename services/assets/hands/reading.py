@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from congrasp.common.errors import CongraspError
+from congrasp.common.runtime.confinement import Limits
 from congrasp.common.runtime.physics_library import mujoco
 from congrasp.services.assets.confined import EnvironmentFailure, call_confined
 
@@ -62,9 +63,7 @@ def confined(
                 function,
                 folder,
                 {"path": str(path), **options},
-                memory=MEMORY,
-                seconds=SECONDS,
-                patience=patience,
+                Limits(memory=MEMORY, processor_s=SECONDS, patience_s=patience),
             )
         except TimeoutError:
             raise CongraspError(

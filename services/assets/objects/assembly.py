@@ -1,6 +1,7 @@
 """Assembly of an object: from the meshes of a source to a `GraspObject`."""
 
 import dataclasses
+import functools
 import pathlib
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
@@ -14,6 +15,7 @@ from congrasp.common.objects import shapes
 from congrasp.common.objects.resting import rest_poses
 from congrasp.common.objects.shapes import halves, sample_mesh
 from congrasp.common.objects.spec import Colours, GraspObject, Piece
+from congrasp.common.runtime.progress import Progress, ignore_progress
 from congrasp.services.assets.objects import repair
 from congrasp.services.assets.objects.affordance import cut_to_hold, with_labels
 from congrasp.services.assets.objects.bodies import largest_body, without_table
@@ -106,13 +108,16 @@ class _Labels(NamedTuple):
     """(N,) part of each surface point."""
 
 
-def assemble(source: Source, options: ImportOptions, seed: int) -> GraspObject:
+def assemble(
+    source: Source, options: ImportOptions, seed: int, progress: Progress = ignore_progress
+) -> GraspObject:
     """Builds the object of a source.
 
     Args:
       source: the files.
       options: options of the import.
       seed: seed of its surface points.
+      progress: called with the activities of the import.
 
     Raises:
       CongraspError: a mesh cannot be used.
@@ -126,7 +131,8 @@ def assemble(source: Source, options: ImportOptions, seed: int) -> GraspObject:
     # Weighed before the cut into pieces, which takes long: the material may be unknown.
     weight_by_material = _weigh_by_material(source, shape, options)
     file_pieces = [scale.points(piece) for piece in files.pieces]
-    collision = _collision(source, file_pieces, surfaces, options, notes)
+    collision = _collision(source, file_pieces, surfaces, options, notes, progress)
+    progress("Weighing", 0, 0)
     weight = weight_by_material
     if weight is None:
         weight = _weigh_evenly(source, shape, collision, options)
@@ -166,7 +172,8 @@ def assemble(source: Source, options: ImportOptions, seed: int) -> GraspObject:
         volume_error=collision.errors.volume,
         colours=colours,
     )
-    obj = dataclasses.replace(obj, rest_poses=rest_poses(obj))
+    on_candidate = functools.partial(progress, "Finding resting poses")
+    obj = dataclasses.replace(obj, rest_poses=rest_poses(obj, on_candidate))
     return obj if source.parts else cut_to_hold(obj)
 
 
@@ -315,6 +322,7 @@ def _collision(
     surfaces: Surfaces,
     options: ImportOptions,
     notes: list[str],
+    progress: Progress,
 ) -> Collision:
     """Convex pieces of an object (`collision.convex_pieces`).
 
@@ -323,7 +331,9 @@ def _collision(
     """
     has_surface = bool(source.visuals)
     try:
-        return convex_pieces(file_pieces, surfaces, options, notes, has_surface=has_surface)
+        return convex_pieces(
+            file_pieces, surfaces, options, notes, has_surface=has_surface, progress=progress
+        )
     except QhullError:
         raise CongraspError(
             f"{source.path} has no volume: its points lie in a plane.",

@@ -11,6 +11,7 @@ import trimesh
 from scipy.spatial import ConvexHull, QhullError
 
 from congrasp.common.objects import shapes
+from congrasp.common.runtime.progress import Progress, ignore_progress
 from congrasp.services.assets.objects import repair
 from congrasp.services.assets.objects.decompose import CUT_DEPTH_M, Decomposition, decompose
 from congrasp.services.assets.objects.fidelity import Fidelity, fidelity
@@ -59,6 +60,7 @@ def convex_pieces(
     notes: list[str],
     *,
     has_surface: bool = True,
+    progress: Progress = ignore_progress,
 ) -> Collision:
     """Returns the pieces of the object's folder if they are close enough, else the closer ones.
 
@@ -68,12 +70,13 @@ def convex_pieces(
       options: options of the import.
       notes: the selected pieces and their errors are appended.
       has_surface: False if the surfaces are those of the pieces.
+      progress: called with the counts of a cut.
 
     Raises:
       scipy.spatial.QhullError: the object has no volume.
     """
     if not own_pieces:
-        cut = _cut_or_fill(surfaces, options, notes)
+        cut = _cut_or_fill(surfaces, options, notes, progress)
         notes.append(str(cut))
         return cut
     hulls = merge(list(own_pieces), options.max_pieces, surfaces.triangles, surfaces.volume)
@@ -87,7 +90,7 @@ def convex_pieces(
         return merged
     cut_notes: list[str] = []
     try:
-        cut = _cut_or_fill(surfaces, options, cut_notes)
+        cut = _cut_or_fill(surfaces, options, cut_notes, progress)
     except QhullError:
         cut = merged  # the surface lies in a plane
     if cut.errors.tolerance_ratio < merged.errors.tolerance_ratio:
@@ -101,7 +104,9 @@ def convex_pieces(
     return merged
 
 
-def _cut_or_fill(surfaces: Surfaces, options: ImportOptions, notes: list[str]) -> Collision:
+def _cut_or_fill(
+    surfaces: Surfaces, options: ImportOptions, notes: list[str], progress: Progress
+) -> Collision:
     """A decomposition of each mesh, or the hulls of the meshes if those are closer.
 
     Each mesh may have pieces according to its share of the volume. Pieces that are too coarse are
@@ -111,12 +116,12 @@ def _cut_or_fill(surfaces: Surfaces, options: ImportOptions, notes: list[str]) -
     volumes = np.array([hull.volume for hull in mesh_hulls])
     limits = [max(1, int(limit)) for limit in options.max_pieces * volumes / volumes.sum()]
     cut_notes: list[str] = []
-    cut = _cut_to_depth(surfaces, limits, CUT_DEPTH_M, cut_notes)
+    cut = _cut_to_depth(surfaces, limits, CUT_DEPTH_M, cut_notes, progress)
     count = len(cut.hulls)
     is_convex = count == len(mesh_hulls)
     if cut.errors.tolerance_ratio > 1 and not is_convex and count < options.max_pieces:
         finer_notes: list[str] = []
-        finer = _cut_to_depth(surfaces, limits, CUT_DEPTH_M / 2, finer_notes)
+        finer = _cut_to_depth(surfaces, limits, CUT_DEPTH_M / 2, finer_notes, progress)
         if finer.errors.tolerance_ratio < cut.errors.tolerance_ratio:
             cut = finer
             cut_notes = finer_notes
@@ -134,7 +139,11 @@ def _cut_or_fill(surfaces: Surfaces, options: ImportOptions, notes: list[str]) -
 
 
 def _cut_to_depth(
-    surfaces: Surfaces, limits: Sequence[int], depth: float, notes: list[str]
+    surfaces: Surfaces,
+    limits: Sequence[int],
+    depth: float,
+    notes: list[str],
+    progress: Progress,
 ) -> Collision:
     """The pieces of each mesh.
 
@@ -143,33 +152,36 @@ def _cut_to_depth(
       limits: largest number of pieces of each mesh.
       depth: depth of a hollow in a piece from which it is cut, m.
       notes: what a decomposer reports is appended.
+      progress: see `convex_pieces`.
     """
     hulls: list[np.ndarray] = []
     owners: list[int] = []
     for owner, limit in enumerate(limits):
-        decomposition = _cut_mesh(surfaces, owner, limit, depth)
+        decomposition = _cut_mesh(surfaces, owner, limit, depth, progress)
         notes += decomposition.notes
         hulls += decomposition.pieces
         owners += [owner] * len(decomposition.pieces)
     return _collision_of(surfaces, hulls, owners)
 
 
-def _cut_mesh(surfaces: Surfaces, owner: int, max_pieces: int, depth: float) -> Decomposition:
+def _cut_mesh(
+    surfaces: Surfaces, owner: int, max_pieces: int, depth: float, progress: Progress
+) -> Decomposition:
     """The pieces of one of the meshes."""
-    mesh = surfaces.meshes[owner]
-    shown = surfaces.shown[owner]
+    mesh = surfaces.shown[owner]
     small = repair.with_few_faces(mesh)
     volume = None
     if surfaces.volume is not None and (small is mesh or repair.encloses(small)):
         is_only_mesh = len(surfaces.meshes) == 1
-        volume = surfaces.volume if is_only_mesh else float(shown.volume)
+        volume = surfaces.volume if is_only_mesh else float(mesh.volume)
     return decompose(
         np.asarray(small.vertices),
         np.asarray(small.faces),
-        shown=None if shown is mesh else np.asarray(shown.triangles),
+        is_filled=mesh is not surfaces.meshes[owner],
         volume=volume,
         max_pieces=max_pieces,
         depth=depth,
+        progress=progress,
     )
 
 

@@ -10,20 +10,25 @@ has one thread, and a process that does not start, is short of time or memory, o
 is an error, not another shape.
 """
 
+import functools
 import pathlib
 import tempfile
 from typing import Any, NamedTuple
 
 import numpy as np
+import trimesh
 from scipy.spatial import ConvexHull
 from trimesh.geometry import faces_to_edges
-from trimesh.graph import is_watertight
+from trimesh.graph import connected_component_labels, is_watertight
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import shapes
 from congrasp.common.objects.spec import MAX_MESH_PIECES
+from congrasp.common.runtime.confinement import Limits
+from congrasp.common.runtime.progress import Progress, ignore_progress
 from congrasp.services.assets.confined import EnvironmentFailure, OutOfResources, call_confined
 from congrasp.services.assets.objects.bodies import bodies
+from congrasp.services.assets.objects.cut_progress import log_to, read_count, write_joins
 from congrasp.services.assets.objects.hulls import corners_of, deepest, solid_hull
 from congrasp.services.assets.objects.interior import enclosed
 from congrasp.services.assets.objects.manifold import manifold
@@ -53,6 +58,14 @@ _REPAIR_CELLS = 50
 """Cells along a closed surface that is repaired by CoACD."""
 _WALL_CELLS = 40
 """Cells along an open surface from which CoACD makes a thin wall."""
+_MAX_TUNNELS = 10
+"""Most tunnels of a filled mesh that is cut without rebuilding its surface."""
+_REBUILT_CELLS = 45
+"""Cells along half of a surface that is rebuilt for its tunnels."""
+_REBUILT_OFFSET = 0.55
+"""Distance of a rebuilt surface from the mesh, in cells: CoACD's level set."""
+_REBUILT_COARSENESS = 4 / 3
+"""Depth for a rebuilt surface, relative to another one's."""
 _MAX_VHACD_HULLS = 1 << 20
 _PACKAGES = {"coacd": "coacd", "vhacd": "vhacdx"}
 """Package of each decomposer."""
@@ -68,6 +81,8 @@ class _Cut(NamedTuple):
     volume: float | None
     """See `decompose`."""
     max_pieces: int
+    is_filled: bool
+    """See `decompose`."""
     depth: float
     """See `decompose`."""
 
@@ -89,36 +104,42 @@ def decompose(
     *,
     volume: float | None,
     max_pieces: int = MAX_MESH_PIECES,
-    shown: np.ndarray | None = None,
+    is_filled: bool = False,
     depth: float = CUT_DEPTH_M,
+    progress: Progress = ignore_progress,
 ) -> Decomposition:
     """Decomposes a triangle mesh into as few convex pieces as preserve its shape.
 
     Args:
       vertices: (V, 3), m, not all in a plane.
       faces: (F, 3).
-      volume: volume that the approximated surface encloses if the mesh is closed
-        (`interior.enclosed`), m^3; one close to that of the hull needs no decomposition.
+      volume: volume that the mesh encloses if it is closed (`interior.enclosed`), m^3; one close to
+        that of the hull needs no decomposition.
       max_pieces: most pieces.
-      shown: (T, 3, 3) corners of the surface to approximate, m, such as the mesh's without its
-        hollows; by default the mesh's.
+      is_filled: True if hollows of the mesh were filled (`hollows.without_hollows`). It has no
+        walls then, and remains of walls leave folds and tunnels in its surface.
       depth: depth of a hollow in a piece from which it is cut, m.
+      progress: called with the pieces that are cut, and then with the joins that are made.
 
     Raises:
       CongraspError: a decomposer exceeds `MAX_PROCESSOR_S` or cannot run here, or the machine lacks
         time or memory for it.
     """
-    if shown is None:
-        shown = vertices[faces]
     hull = shapes.hull_of(vertices)
-    if volume is not None and _is_convex(hull, shown, volume):
+    if volume is not None and _is_convex(hull, vertices[faces], volume):
         return Decomposition([corners_of(hull)], "convex", [])
-    mesh = {"vertices": vertices, "faces": faces, "shown": shown}
+    mesh = {"vertices": vertices, "faces": faces}
     notes: list[str] = []
     for method in _PACKAGES:
-        cut = _Cut(method=method, volume=volume, max_pieces=max_pieces, depth=depth)
+        cut = _Cut(
+            method=method,
+            volume=volume,
+            max_pieces=max_pieces,
+            is_filled=is_filled,
+            depth=depth,
+        )
         try:
-            pieces = _cut_in_child(mesh, cut)
+            pieces = _cut_in_child(mesh, cut, progress)
             return Decomposition(pieces, method, notes)
         except ChildProcessError as error:
             notes.append(f"{method} {error}")
@@ -126,12 +147,13 @@ def decompose(
     return Decomposition([corners_of(hull)], "hull", notes)
 
 
-def _cut_in_child(mesh: dict[str, Any], cut: _Cut) -> list[np.ndarray]:
+def _cut_in_child(mesh: dict[str, Any], cut: _Cut, progress: Progress) -> list[np.ndarray]:
     """Vertices (V, 3) of the pieces that a confined process cuts.
 
     Args:
-      mesh: arrays `vertices`, `faces` and `shown`; see `decompose`.
+      mesh: arrays `vertices` and `faces`; see `decompose`.
       cut: options of the cut.
+      progress: see `decompose`.
 
     Raises:
       CongraspError: it exceeds `MAX_PROCESSOR_S` or cannot run here, or the machine lacks time or
@@ -142,15 +164,22 @@ def _cut_in_child(mesh: dict[str, Any], cut: _Cut) -> list[np.ndarray]:
     with tempfile.TemporaryDirectory(prefix="congrasp-") as name:
         folder = pathlib.Path(name)
         np.savez(folder / _MESH, **mesh)
+
+        def report() -> None:
+            """Reports the current count."""
+            progress(*read_count(folder))
+
+        report()
         try:
             call_confined(
                 write_pieces,
                 folder,
                 cut._asdict(),
-                memory=_ADDRESS_SPACE_BYTES,
-                seconds=MAX_PROCESSOR_S,
-                patience=patience,
+                Limits(
+                    memory=_ADDRESS_SPACE_BYTES, processor_s=MAX_PROCESSOR_S, patience_s=patience
+                ),
                 packages=(_PACKAGES[cut.method],),
+                on_wait=report,
             )
         except TimeoutError:
             raise CongraspError(
@@ -168,6 +197,7 @@ def _cut_in_child(mesh: dict[str, Any], cut: _Cut) -> list[np.ndarray]:
                 f"The mesh cannot be cut into convex pieces here: {cut.method} {error}.",
                 "Remove that cause and import the object again.",
             ) from None
+        report()
         with np.load(folder / _PIECES) as arrays:
             pieces = list(arrays.values())
     if not pieces:
@@ -183,17 +213,26 @@ def write_pieces(folder: pathlib.Path, **options: Any) -> None:
       options: the fields of `_Cut`.
     """
     cut = _Cut(**options)
+    log_to(folder)
     with np.load(folder / _MESH) as arrays:
         vertices = arrays["vertices"]
         faces = arrays["faces"]
-        shown = arrays["shown"]
     if cut.method == "coacd":
         pieces = _by_coacd(vertices, faces, cut)
     else:
         pieces = _by_vhacd(vertices, faces, cut.max_pieces)
     hulls = [solid_hull(np.asarray(piece, np.float64)) for piece in pieces]
     solid = [hull.points for hull in hulls if hull is not None]
-    np.savez(folder / _PIECES, *merge(solid, cut.max_pieces, shown, cut.volume))
+    on_join = functools.partial(write_joins, folder)
+    joined = merge(
+        solid,
+        cut.max_pieces,
+        vertices[faces],
+        cut.volume,
+        has_walls=not cut.is_filled,
+        on_join=on_join,
+    )
+    np.savez(folder / _PIECES, *joined)
 
 
 def _by_vhacd(vertices: np.ndarray, faces: np.ndarray, max_pieces: int) -> list[np.ndarray]:
@@ -210,6 +249,8 @@ def _by_coacd(vertices: np.ndarray, faces: np.ndarray, cut: _Cut) -> list[np.nda
     """Vertices of the pieces of a mesh, cut by CoACD."""
     if not cut.volume:
         return _body_by_coacd(vertices, faces, _WALL_COARSENESS * cut.depth, closed=False)
+    if cut.is_filled and _tunnels(vertices, faces) > _MAX_TUNNELS:
+        return _rebuilt_by_coacd(vertices, faces, _REBUILT_COARSENESS * cut.depth)
     whole = manifold(vertices, faces)
     if whole is not None:
         vertices, faces = whole
@@ -218,6 +259,37 @@ def _by_coacd(vertices: np.ndarray, faces: np.ndarray, cut: _Cut) -> list[np.nda
     for body_vertices, body_faces in bodies(vertices, faces):
         pieces += _body_by_coacd(body_vertices, body_faces, cut.depth, closed=True)
     return pieces
+
+
+def _tunnels(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Number of tunnels through the bodies of a closed mesh, by its Euler characteristic."""
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    labels = connected_component_labels(mesh.edges, len(vertices))
+    bodies_count = len(np.unique(labels[faces]))
+    return bodies_count - mesh.euler_number / 2
+
+
+def _rebuilt_by_coacd(vertices: np.ndarray, faces: np.ndarray, depth: float) -> list[np.ndarray]:
+    """Vertices of the pieces of a closed mesh with many small folds and tunnels.
+
+    CoACD rebuilds the surface on a grid, without the folds and tunnels that it would cut into
+    crumbs. The rebuilt surface lies outside of the mesh, so that the mesh is made smaller before.
+    """
+    import coacd
+
+    size = np.ptp(vertices, axis=0).max()
+    cell = size / 2 / _REBUILT_CELLS
+    normals = trimesh.Trimesh(vertices, faces, process=False).vertex_normals
+    pieces = coacd.run_coacd(
+        coacd.Mesh(vertices - _REBUILT_OFFSET * cell * normals, faces),
+        threshold=min(1.0, max(_MIN_THRESHOLD, depth / size)),
+        preprocess_mode="on",
+        preprocess_resolution=_REBUILT_CELLS,
+        merge=False,
+        seed=0,
+        **_SEARCH,
+    )
+    return [piece[0] for piece in pieces]
 
 
 def _body_by_coacd(

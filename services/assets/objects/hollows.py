@@ -15,6 +15,9 @@ _PROBE_STEPS = (1.0, 1.5, 2.0)
 _VOLUME_RATIOS = (0.8, 1.2)
 """Volume added by filling relative to that of the hollow by cubes."""
 
+_CRUMB_SHARE = 1e-5
+"""Volume of a negligible body relative to that of the mesh."""
+
 
 def without_hollows(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
     """Returns a closed mesh without the walls of hollows, whose openings are closed.
@@ -43,6 +46,7 @@ def without_hollows(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
         filled = fill(filled, loops)
     if not encloses(filled):
         return mesh
+    filled = _without_crumbs(filled)
     volume = float(hollow.sum()) * cubes.spacing**3
     low, high = _VOLUME_RATIOS
     if not low < (filled.volume - mesh.volume) / volume < high:
@@ -52,3 +56,12 @@ def without_hollows(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
         f"collision shape"
     )
     return filled
+
+
+def _without_crumbs(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A closed mesh without bodies of negligible volume, such as remains of a hollow's wall."""
+    mesh.merge_vertices()
+    shells = mesh.split(only_watertight=False)
+    min_volume = _CRUMB_SHARE * mesh.volume
+    solid = [shell for shell in shells if abs(shell.volume) > min_volume]
+    return trimesh.util.concatenate(solid)

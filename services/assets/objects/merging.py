@@ -6,6 +6,7 @@ of the bend on either side.
 """
 
 import heapq
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -64,20 +65,39 @@ class _Part(NamedTuple):
 
 
 class _Join(NamedTuple):
-    """Cost of joining two pieces."""
+    """A possible join of two pieces."""
 
     cost: float
+    """Measured, or a lower bound."""
     first: int
     second: int
-    growth: float
+    error: float
+    """Of the joined piece (`_Part.error`), or a lower bound, m."""
+    measured: "_Joined | None" = None
+    """None before the join is measured."""
+
+
+class _Joined(NamedTuple):
+    """Result of a join."""
+
     part: _Part
+    growth: float
+    """Volume that the join adds, m^3."""
 
 
 class _Merger:
     """Pieces by number, the neighbours of each, and the possible joins."""
 
-    def __init__(self, pieces: list[np.ndarray], triangles: np.ndarray, volume: float | None):
+    def __init__(
+        self,
+        pieces: list[np.ndarray],
+        triangles: np.ndarray,
+        volume: float | None,
+        *,
+        has_walls: bool,
+    ):
         """Takes the arguments of `merge`."""
+        self._has_walls = has_walls
         random = np.random.default_rng(0)
         surface = shapes.on_triangles(triangles, random.random((SURFACE_SAMPLES, 3)))[0]
         self._surface = _sort_by_x(surface)
@@ -96,14 +116,11 @@ class _Merger:
         self._distance = distance_transform_edt(~self._voxels.inside, self._voxels.spacing)
         self.parts = {i: self._part(hull) for i, hull in enumerate(hulls)}
         self._count = len(self.parts)
-        self._neighbors: dict[int, set[int]] = {i: set() for i in self.parts}
+        self._neighbors: dict[int, dict[int, float]] = {i: {} for i in self.parts}
+        """Neighbours of each piece, and a lower bound of the error of their join, m."""
         self._joins: list[_Join] = []
-        for i in self.parts:
-            for j in range(i):
-                if _are_neighbours(self.parts[i].hull, self.parts[j].hull):
-                    self._neighbors[i].add(j)
-                    self._neighbors[j].add(i)
-                    self._add_join(i, j)
+        for i, j in _neighbours([part.hull for part in self.parts.values()]):
+            self._add_join(i, j, 0.0)
 
     def _part(self, hull: ConvexHull) -> _Part:
         """A piece of this hull, thinner along its shortest axis where the mesh does not fill it."""
@@ -112,7 +129,8 @@ class _Merger:
         shift = 0.0
         if self._inner is not None:
             hollow_share = self._hollow_share(hull, self._inner)
-            thinned, shift = _thin(hull, hollow_share)
+            if self._has_walls:
+                thinned, shift = _thin(hull, hollow_share)
         near_surface = _in_box(thinned, self._surface)
         depth = -signed_distances(thinned, near_surface).min(initial=0.0)
         probes, _, _ = shapes.on_triangles(thinned.points[thinned.simplices], self._probes)
@@ -129,26 +147,51 @@ class _Merger:
         share = (signed_distances(hull, tested) < 0).mean()
         return float(1 - share * len(near) / len(inner) * self._volume / hull.volume)
 
-    def reduce(self, max_pieces: int) -> None:
+    def reduce(self, max_pieces: int, on_join: Callable[[int, int], None]) -> None:
         """Joins pieces, cheapest first, until no join is left.
 
         Below the limit of pieces only joins within tolerances are made.
+
+        Args:
+          max_pieces: largest number of pieces.
+          on_join: see `merge`.
         """
         grown = 0.0
+        first_count = self._count
+        required = max(0, first_count - max_pieces)
         while self._joins:
             join = heapq.heappop(self._joins)
             if join.first not in self.parts or join.second not in self.parts:
                 continue
             is_optional = len(self.parts) <= max_pieces
-            too_coarse = join.part.error > MAX_JOIN_DEPTH_M
-            too_large = grown + join.growth > MAX_JOIN_GROWTH * self._volume
-            if is_optional and (too_coarse or too_large):
+            if is_optional and join.error > MAX_JOIN_DEPTH_M:
                 continue
-            grown += join.growth
-            self._apply(join)
+            if join.measured is None:
+                self._measure(join.first, join.second)
+                continue
+            growth = join.measured.growth
+            if is_optional and grown + growth > MAX_JOIN_GROWTH * self._volume:
+                continue
+            grown += growth
+            self._apply(join.first, join.second, join.measured.part)
+            done = self._count - first_count
+            on_join(done, max(done, required))
 
-    def _add_join(self, i: int, j: int) -> None:
-        """Adds the join of two pieces."""
+    def _add_join(self, i: int, j: int, error: float) -> None:
+        """Adds the join of two pieces, to be measured when no other one can be cheaper.
+
+        Args:
+          i: number of the first piece.
+          j: number of the second piece.
+          error: lower bound of the error of the joined piece, m.
+        """
+        self._neighbors[i][j] = error
+        self._neighbors[j][i] = error
+        cost = error / MAX_SURFACE_ERROR_M
+        heapq.heappush(self._joins, _Join(cost, i, j, error))
+
+    def _measure(self, i: int, j: int) -> None:
+        """Adds the join of two pieces with its cost."""
         first = self.parts[i]
         second = self.parts[j]
         vertices = np.concatenate([first.vertices, second.vertices])
@@ -159,26 +202,41 @@ class _Merger:
         growth = max(0.0, part.hull.volume - first.hull.volume - second.hull.volume)
         filled = max(0.0, part.hollow - first.hollow - second.hollow)
         cost = part.error / MAX_SURFACE_ERROR_M + filled / (MAX_VOLUME_ERROR * self._volume)
-        join = _Join(cost=cost, first=i, second=j, growth=growth, part=part)
-        heapq.heappush(self._joins, join)
+        self._neighbors[i][j] = part.error
+        self._neighbors[j][i] = part.error
+        joined = _Joined(part, growth)
+        heapq.heappush(self._joins, _Join(cost, i, j, part.error, joined))
 
-    def _apply(self, join: _Join) -> None:
-        """Replaces two pieces by their join."""
+    def _apply(self, first: int, second: int, part: _Part) -> None:
+        """Replaces two pieces by their join.
+
+        A larger hull has more of the surface in it: the join with a neighbour is not expected to be
+        closer to the surface than the joins of the two pieces with it were.
+        """
         new = self._count
-        joined = {join.first, join.second}
         self._count += 1
-        for i in joined:
+        errors = self._neighbors.pop(first)
+        for k, error in self._neighbors.pop(second).items():
+            errors[k] = max(error, errors.get(k, 0.0))
+        for i in (first, second):
             del self.parts[i]
-        self.parts[new] = join.part
-        neighbors = self._neighbors.pop(join.first) | self._neighbors.pop(join.second)
-        self._neighbors[new] = neighbors - joined
-        for k in self._neighbors[new]:
-            self._neighbors[k] = self._neighbors[k] - joined | {new}
-            self._add_join(new, k)
+            del errors[i]
+        self.parts[new] = part
+        self._neighbors[new] = {}
+        for k, error in errors.items():
+            self._neighbors[k].pop(first, None)
+            self._neighbors[k].pop(second, None)
+            self._add_join(new, k, error)
 
 
 def merge(
-    pieces: list[np.ndarray], max_pieces: int, triangles: np.ndarray, volume: float | None
+    pieces: list[np.ndarray],
+    max_pieces: int,
+    triangles: np.ndarray,
+    volume: float | None,
+    *,
+    has_walls: bool = True,
+    on_join: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[np.ndarray]:
     """Joins neighbouring pieces until `max_pieces` are left, then while the shape is preserved.
 
@@ -193,9 +251,11 @@ def merge(
       max_pieces: largest number of pieces.
       triangles: (F, 3, 3) corners of the surface that they approximate, m.
       volume: volume of the object, m^3; None for an open surface, whose pieces are not thinned.
+      has_walls: False if the object is solid, so that no piece is thinned.
+      on_join: called after each join with the number of joins, and that of all required ones.
     """
-    merger = _Merger(pieces, triangles, volume)
-    merger.reduce(max_pieces)
+    merger = _Merger(pieces, triangles, volume, has_walls=has_walls)
+    merger.reduce(max_pieces, on_join)
     return [corners_of(part.hull) for part in merger.parts.values()]
 
 
@@ -217,13 +277,17 @@ def _thin(hull: ConvexHull, hollow_share: float) -> tuple[ConvexHull, float]:
     return shapes.hull_of(vertices + np.outer(inwards * shift / largest, axis)), shift
 
 
-def _are_neighbours(first: ConvexHull, second: ConvexHull) -> bool:
-    """True if the boxes around two hulls touch, and no side of one separates it from the other."""
-    before = (first.min_bound < second.max_bound + _MAX_NEIGHBOUR_GAP_M).all()
-    after = (second.min_bound < first.max_bound + _MAX_NEIGHBOUR_GAP_M).all()
-    if not (before and after):
-        return False
-    return not (_separates(first, second) or _separates(second, first))
+def _neighbours(hulls: list[ConvexHull]) -> Iterator[tuple[int, int]]:
+    """Yields pairs of hulls whose boxes touch, and of which no side of one separates it from the
+    other.
+    """
+    low = np.array([hull.min_bound for hull in hulls])
+    high = np.array([hull.max_bound for hull in hulls]) + _MAX_NEIGHBOUR_GAP_M
+    for i, hull in enumerate(hulls):
+        touches = ((low[i] < high[:i]) & (low[:i] < high[i])).all(-1)
+        for j in np.flatnonzero(touches).tolist():
+            if not (_separates(hull, hulls[j]) or _separates(hulls[j], hull)):
+                yield i, j
 
 
 def _separates(hull: ConvexHull, other: ConvexHull) -> bool:

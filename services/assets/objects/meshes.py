@@ -14,6 +14,7 @@ from congrasp.common.io.files import cache_folder
 from congrasp.common.io.inputs import read_file
 from congrasp.common.objects import store
 from congrasp.common.objects.spec import GraspObject
+from congrasp.common.runtime.progress import Progress, ignore_progress
 from congrasp.common.runtime.resources import cores, memory
 from congrasp.services.assets.objects.assembly import assemble
 from congrasp.services.assets.objects.decompose import (
@@ -25,7 +26,7 @@ from congrasp.services.assets.objects.file_kinds import CHECK, MAX_BYTES
 from congrasp.services.assets.objects.options import ImportOptions, check_options
 from congrasp.services.assets.objects.sources import Source
 
-_CACHE_VERSION = 16
+_CACHE_VERSION = 17
 """A new one imports every object again: its pieces, mass or colours are made in another way."""
 _DRAWS_VERSION = 8
 """A new one changes the surface points of every object, and with them all measurements."""
@@ -33,12 +34,19 @@ _PATIENCE_S = 600.0
 """Time beyond the limits of an object's decompositions."""
 
 
-def import_source(source: Source, options: ImportOptions) -> GraspObject:
+def import_source(
+    source: Source, options: ImportOptions, progress: Progress = ignore_progress
+) -> GraspObject:
     """Imports one object, or reads it from the cache; its `notes` are for the user.
 
     Its origin moves to the centre of mass; its orientation stays that of the file. Parts come from
     part files; an object without them is labelled by two halves, the slimmer one graspable if a
     hand can close on it (`cut_to_hold`).
+
+    Args:
+      source: the files.
+      options: options of the import.
+      progress: called with the activities of the import.
 
     Raises:
       CongraspError: an option is invalid, or a mesh cannot be used; the message names it, its fault
@@ -53,7 +61,7 @@ def import_source(source: Source, options: ImportOptions) -> GraspObject:
             return store.load(cached)
         except CongraspError:
             pass  # it is damaged, and replaced below
-    obj = assemble(source, options, seed=int(key, 16))
+    obj = assemble(source, options, seed=int(key, 16), progress=progress)
     with contextlib.suppress(CongraspError):  # of a full disk, or of a read-only folder
         store.save(obj, cached)
     return obj

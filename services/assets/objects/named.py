@@ -13,6 +13,7 @@ from congrasp.common.objects import store
 from congrasp.common.objects.procedural import family_turns, generate
 from congrasp.common.objects.spec import GraspObject
 from congrasp.common.runtime.parallel import parallel_map
+from congrasp.common.runtime.progress import Progress, ignore_progress
 from congrasp.services.assets.objects.file_kinds import CHECK, MAX_BYTES, SUFFIXES
 from congrasp.services.assets.objects.meshes import import_source, import_sources
 from congrasp.services.assets.objects.options import ImportOptions
@@ -37,14 +38,17 @@ class ObjectAt(NamedTuple):
         """True for an object of the generator, whose path is FAMILY:SEED."""
         return not self.source and self.path.suffix != store.SUFFIX
 
-    def load(self, options: ImportOptions = _METRES_OR_ASK) -> GraspObject:
-        """Reads, imports or generates the object; the options apply to meshes alone.
+    def load(
+        self, options: ImportOptions = _METRES_OR_ASK, progress: Progress = ignore_progress
+    ) -> GraspObject:
+        """Reads, imports or generates the object; the options and the progress apply to meshes
+        alone.
 
         Raises:
           CongraspError: it cannot be read or imported.
         """
         if self.source:
-            return import_source(self.source, options)
+            return import_source(self.source, options, progress)
         if not self.is_generated:
             return store.load(self.path)
         family, _, seed = str(self.path).partition(":")

@@ -30,6 +30,7 @@ import pytest
 
 from congrasp.common.errors import CongraspError
 from congrasp.common.objects import shapes, store
+from congrasp.common.runtime.confinement import Limits
 from congrasp.services.arm.description import load_arm
 from congrasp.services.assets.confined import EnvironmentFailure, call_confined
 from congrasp.services.assets.hands import model_files, reading
@@ -221,5 +222,6 @@ def test_the_number_of_included_files_is_limited(tmp_path, count):
 def test_an_answer_that_cannot_be_written_is_an_environment_error(tmp_path):
     """As on a full disk: a folder has the name of the answer's file."""
     (tmp_path / "answer.json").mkdir()
+    limits = Limits(memory=1 << 30, processor_s=30.0, patience_s=300.0)
     with pytest.raises(EnvironmentFailure, match=r"^failed \(IsADirectoryError: "):
-        call_confined(os.path.basename, tmp_path, {}, memory=1 << 30, seconds=30.0, patience=300.0)
+        call_confined(os.path.basename, tmp_path, {}, limits)

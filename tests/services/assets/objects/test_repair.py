@@ -10,6 +10,8 @@ import trimesh
 from congrasp.common.errors import CongraspError
 from congrasp.services.assets.objects import repair
 from congrasp.services.assets.objects.bodies import largest_body, without_table
+from congrasp.services.assets.objects.decompose import decompose
+from congrasp.services.assets.objects.fidelity import fidelity
 from congrasp.services.assets.objects.holes import fill, hole_loops
 from congrasp.services.assets.objects.hollows import without_hollows
 from congrasp.services.assets.objects.mesh_files import load_geometry, read_mesh
@@ -364,6 +366,32 @@ def test_a_hollow_that_no_finger_enters_is_filled(neck, filled):
     np.testing.assert_allclose(repaired.volume, (full if filled else bottle).volume, rtol=0.01)
     assert repair.encloses(repaired)
     assert bool(notes) == filled
+
+
+@pytest.mark.slow
+def test_a_filled_mesh_with_tunnels_is_rebuilt():
+    """Eleven tori stand for the tunnels that remain of a wall: they keep their shape."""
+    tori = []
+    for i in range(11):
+        torus = trimesh.creation.torus(0.02, 0.008, major_sections=16, minor_sections=8)
+        tori.append(torus.apply_translation([0.06 * (i % 4), 0.06 * (i // 4), 0]))
+    mesh = trimesh.util.concatenate(tori)
+    result = decompose(
+        mesh.vertices, mesh.faces, volume=mesh.volume, is_filled=True, max_pieces=400
+    )
+    assert result.method == "coacd"
+    errors = fidelity(np.asarray(mesh.triangles), result.pieces, is_closed=True)
+    assert errors.surface < 0.003
+    assert abs(errors.volume) < 0.1
+
+
+def test_a_filled_bottle_is_cut_into_few_solid_pieces():
+    line = [(0, 0), (0.035, 0), (0.035, 0.12), (0.007, 0.15), (0.007, 0.18), (0, 0.18)]
+    bottle = trimesh.creation.revolve(np.array(line), sections=32)
+    result = decompose(bottle.vertices, bottle.faces, volume=bottle.volume, is_filled=True)
+    assert len(result.pieces) <= 4
+    errors = fidelity(np.asarray(bottle.triangles), result.pieces, is_closed=True)
+    assert errors.tolerance_ratio < 1
 
 
 def test_a_hollow_without_an_opening_is_filled():
