@@ -3,6 +3,7 @@
 import numpy as np
 import trimesh
 from scipy.ndimage import binary_propagation, distance_transform_edt, label
+from trimesh.graph import connected_component_labels
 
 from congrasp.services.assets.objects.holes import fill, hole_loops
 from congrasp.services.assets.objects.repair import encloses
@@ -61,7 +62,9 @@ def without_hollows(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
 def _without_crumbs(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """A closed mesh without bodies of negligible volume, such as remains of a hollow's wall."""
     mesh.merge_vertices()
-    shells = mesh.split(only_watertight=False)
-    min_volume = _CRUMB_SHARE * mesh.volume
-    solid = [shell for shell in shells if abs(shell.volume) > min_volume]
-    return trimesh.util.concatenate(solid)
+    labels = connected_component_labels(mesh.face_adjacency, len(mesh.faces))
+    volumes = np.bincount(labels, np.linalg.det(mesh.triangles) / 6)
+    is_solid = np.abs(volumes) > _CRUMB_SHARE * mesh.volume
+    mesh.update_faces(is_solid[labels])
+    mesh.remove_unreferenced_vertices()
+    return mesh
