@@ -170,7 +170,7 @@ def issue(
             (complete / name).write_bytes(content)
         if target.exists():
             shutil.rmtree(target)
-        complete.rename(target)
+        complete.replace(target)
     return target
 
 
