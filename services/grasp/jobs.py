@@ -89,7 +89,7 @@ def grasp_object(
         if facts is not None:
             return Result(entry.name, facts, skipped=True)
         if settings.draws:
-            # It takes one core for seconds, as does the import after it, which waits for a process
+            # Compiling takes seconds of one core; meanwhile the import waits for another process.
             threading.Thread(target=compile_loops).start()
         obj = _object_of(job, progress)
         request = _request_for(obj, grasper, job)

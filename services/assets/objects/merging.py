@@ -68,11 +68,11 @@ class _Join(NamedTuple):
     """A possible join of two pieces."""
 
     cost: float
-    """Measured, or a lower bound."""
+    """Measured, or an expected lower bound (`_Merger._apply`)."""
     first: int
     second: int
     error: float
-    """Of the joined piece (`_Part.error`), or a lower bound, m."""
+    """Of the joined piece (`_Part.error`), or an expected lower bound, m."""
     measured: "_Joined | None" = None
     """None before the join is measured."""
 
@@ -117,7 +117,7 @@ class _Merger:
         self.parts = {i: self._part(hull) for i, hull in enumerate(hulls)}
         self._count = len(self.parts)
         self._neighbors: dict[int, dict[int, float]] = {i: {} for i in self.parts}
-        """Neighbours of each piece, and a lower bound of the error of their join, m."""
+        """Neighbours of each piece, and the error of their join or an expected lower bound, m."""
         self._joins: list[_Join] = []
         for i, j in _neighbours([part.hull for part in self.parts.values()]):
             self._add_join(i, j, 0.0)
@@ -183,7 +183,7 @@ class _Merger:
         Args:
           i: number of the first piece.
           j: number of the second piece.
-          error: lower bound of the error of the joined piece, m.
+          error: expected lower bound of the error of the joined piece, m.
         """
         self._neighbors[i][j] = error
         self._neighbors[j][i] = error
@@ -210,8 +210,9 @@ class _Merger:
     def _apply(self, first: int, second: int, part: _Part) -> None:
         """Replaces two pieces by their join.
 
-        A larger hull has more of the surface in it: the join with a neighbour is not expected to be
-        closer to the surface than the joins of the two pieces with it were.
+        A larger hull has more of the surface in it. Its join with a neighbour is therefore expected
+        to deviate at least as far as the worse of the two pieces' joins with that neighbour, though
+        the samples and the thinning of pieces allow exceptions.
         """
         new = self._count
         self._count += 1

@@ -68,10 +68,10 @@ main.main(["serve" if KIND == "loading" else "plot"])
 )
 def test_command_ends_with_one_line(kind, number, code, word):
     # Whoever started the tests may ignore the signal, as nohup does.
-    heed = f"import signal; signal.signal({number:d}, signal.SIG_DFL)"
+    restore = f"import signal; signal.signal({number:d}, signal.SIG_DFL)"
     if number == signal.SIGINT:
-        heed = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
-    arguments = [sys.executable, "-c", f"{heed}\nKIND = {kind!r}\n{LOOP}"]
+        restore = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    arguments = [sys.executable, "-c", f"{restore}\nKIND = {kind!r}\n{LOOP}"]
     pipe = subprocess.PIPE
     with subprocess.Popen(arguments, stdout=pipe, stderr=pipe, text=True) as process:
         assert process.stdout.readline() == "ready\n"
