@@ -70,6 +70,19 @@ def test_distal_joint_follows_two_thirds_of_the_proximal_one():
     assert deviations(q, in_contact(1)) == pytest.approx([0.1, 0, 0, 0], abs=1e-5)
 
 
+def test_looped_finger_counts_in_contact_too():
+    # The middle joint is 1.3 rad ahead of the neighbour's 0.25 rad, of which 0.7 rad is natural; the
+    # last joint is at two thirds of it.
+    q = posed(index_pip=1.55, index_dip=1.03)
+    assert deviations(q, in_contact(1)) == pytest.approx([0.6, 0, 0, 0], abs=1e-2)
+
+
+def test_finger_between_two_may_bend_like_either():
+    q = posed(index_pip=1.55, index_dip=1.03, middle_pip=1.2, middle_dip=0.8)
+    touching = in_contact(1) | in_contact(2)
+    assert deviations(q, touching) == pytest.approx(np.zeros(4), abs=1e-5)
+
+
 def test_robot_hand_has_no_coupled_joints():
     allegro = get_hand("allegro")
     assert len(finger_joints(allegro).distal) == 0
