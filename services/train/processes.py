@@ -134,7 +134,7 @@ def _connect(
                 break
     if stop.is_set():
         return None
-    raise ProcessDied(f"The learner did not start: {learner.cause()}", learner.log)
+    raise _died(learner, f"The learner did not start: {learner.cause()}")
 
 
 def supervise(
@@ -237,10 +237,16 @@ def _restart_learners(
 def _check_can_restart(child: Child) -> None:
     """Raises a `ProcessDied` if a restart would end in the same way."""
     if child.code == _BAD_INPUT_CODE:
-        raise ProcessDied(child.death(), child.log)
+        raise _died(child, child.death())
     if child.deaths < MAX_RESTARTS:
         return
     cause = child.death()
     if child.deaths:
         cause += f" It died {child.deaths + 1} times without an update of the run between."
-    raise ProcessDied(cause, child.log)
+    raise _died(child, cause)
+
+
+def _died(child: Child, what: str) -> ProcessDied:
+    """Returns the error of a process that has ended."""
+    assert child.log is not None, "all processes of a training have logs"
+    return ProcessDied(what, child.log)
