@@ -8,7 +8,7 @@ process. `SCHEMES` maps schemes to factories; an external transport adds a row.
 import importlib.util
 import os
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
 from congrasp.common.errors import CongraspError
@@ -52,6 +52,8 @@ class Endpoint(NamedTuple):
     """Run of the certificates; None for any."""
     longest_rollout: int | None = None
     """Longest rollout accepted by a learner, in bytes; None for the limit of all messages."""
+    alternatives: Sequence[str] = ()
+    """URLs to which a connection is reopened if that of `url` is lost."""
 
     @property
     def address(self) -> str:
@@ -60,7 +62,13 @@ class Endpoint(NamedTuple):
 
 
 def connect(
-    url: str, role: Peer, *, certs: Certs = None, wait: float = 10.0, run: str | None = None
+    url: str,
+    role: Peer,
+    *,
+    certs: Certs = None,
+    wait: float = 10.0,
+    run: str | None = None,
+    alternatives: Sequence[str] = (),
 ) -> Transport:
     """Connects to the listener at a URL.
 
@@ -70,13 +78,18 @@ def connect(
       certs: folder of the role's certificate, for mutual TLS.
       wait: seconds to wait for a listener.
       run: required run of the certificate.
+      alternatives: URLs of listeners that can replace this one: a lost connection is reopened to
+        the first of all that responds.
 
     Raises:
       CongraspError: the URL is malformed; or the certificates are missing, expired, not accepted,
         or of another role or run; or the listener's certificate does not allow it to listen.
       TransportError: no listener responds.
     """
-    return _open(Endpoint(url, role, listens=False, certs=certs, wait=wait, run=run))
+    endpoint = Endpoint(
+        url, role, listens=False, certs=certs, wait=wait, run=run, alternatives=alternatives
+    )
+    return _open(endpoint)
 
 
 def listen(
@@ -178,7 +191,10 @@ def _open_zenoh(endpoint: Endpoint) -> Transport:
         )
     flows = PEER_FLOWS[endpoint.role]  # type: ignore[index]
     return ZenohTransport(
-        connect=[endpoint.url], flows=flows, wait=endpoint.wait, credentials=credentials
+        connect=[endpoint.url, *endpoint.alternatives],
+        flows=flows,
+        wait=endpoint.wait,
+        credentials=credentials,
     )
 
 

@@ -11,6 +11,7 @@ from congrasp.common.errors import TransportError
 from congrasp.common.transport.ports import SERVER_URL
 from congrasp.services.cli.console import in_range
 from congrasp.services.client.policy_client import PolicyClient
+from congrasp.services.client.workers import joint_health
 
 if TYPE_CHECKING:
     from congrasp.services.serve.load import Example
@@ -46,7 +47,8 @@ class Query:
     certs: pathlib.Path | None = None
     """Folder of a client's certificate (congrasp certs)."""
     health: bool = False
-    """Only check if the server is ready. The exit code is then 0, and 4 if it is not."""
+    """Only check if the server is ready. The exit code is then 0, and 4 if it is not. The numbers
+    of several workers are added up."""
     json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Measure the latency and print it as JSON: p50_ms, p99_ms, answers_per_s, failed,
     overloaded."""
@@ -75,8 +77,7 @@ class Query:
 
     def _print_health(self) -> int:
         """Prints the state of the server; returns the exit code."""
-        with self._client(wait=self.timeout) as client:
-            health = client.health()
+        health = joint_health(self.connect, self.name, timeout=self.timeout, certs=self.certs)
         print(json.dumps(health))
         return 0 if health["ready"] else TransportError.exit_code
 

@@ -12,11 +12,14 @@ import tyro
 from congrasp.common.errors import CongraspError
 from congrasp.common.transport import urls
 from congrasp.common.transport.keys import Keys
-from congrasp.common.transport.ports import SERVER_URL
-from congrasp.services.ops.lifetime import Stop, on_signal
-from congrasp.services.ops.logs import MonitoringOptions, announce_progress, log
+from congrasp.common.transport.ports import SERVER_URL, check_ports, shifted
+from congrasp.services.cli.console import in_range
+from congrasp.services.client.policy_client import MAX_WORKERS
+from congrasp.services.ops.lifetime import Stop, command, on_signal
+from congrasp.services.ops.logs import MonitoringOptions, announce_progress, log, logging_as
 from congrasp.services.ops.metrics import ServerMetrics
 from congrasp.services.ops.waiting import connect_when_up, when_up
+from congrasp.services.serve.workers import run_workers, worker_of
 
 if TYPE_CHECKING:
     from congrasp.services.serve.sources import Source
@@ -55,9 +58,53 @@ class Serve:
     learner."""
     insecure: bool = False
     """Accept connections from other machines without certificates."""
+    workers: int = 1
+    """Number of processes that serve the policy, if one core is the limit. Each listens on its own
+    port, from that of --listen on; --metrics-port counts up likewise. Clients that connect to the
+    first one are distributed over all."""
+    worker: int | None = None
+    """Only run the worker of this number, from 0 on, without the process that restarts workers."""
 
     def __call__(self) -> int:
         """Serves until a signal."""
+        in_range(1, MAX_WORKERS, workers=self.workers)
+        if self.worker is not None:
+            in_range(0, self.workers - 1, worker=self.worker)
+            return self._as_worker(self.worker)._serve()
+        if self.workers > 1:
+            return self._serve_with_workers()
+        return self._serve()
+
+    def _as_worker(self, number: int) -> "Serve":
+        """Returns the options of a worker, with its ports."""
+        metrics_port = self.monitoring.metrics_port
+        if metrics_port:
+            metrics_port += number
+        monitoring = dataclasses.replace(self.monitoring, metrics_port=metrics_port)
+        return dataclasses.replace(self, listen=shifted(self.listen, number), monitoring=monitoring)
+
+    def _serve_with_workers(self) -> int:
+        """Runs the workers until a signal."""
+        check_ports(self.listen, self.workers)
+        workers = [worker_of(i, self._worker_arguments(i)) for i in range(self.workers)]
+        run = self.run if self.connect else ""
+        log_format = self.monitoring.log_format
+        with logging_as(log_format, role="server", id=self.name, run=run), on_signal() as stop:
+            run_workers(workers, stop)
+            log("info", f"The workers end: {stop.reason}.")
+        return stop.exit_code
+
+    def _worker_arguments(self, number: int) -> list[str]:
+        """Words of the command of a worker."""
+        options = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        monitoring = options.pop("monitoring")
+        options |= dataclasses.asdict(monitoring)
+        options["worker"] = number
+        options["connect"] = self.connect or None
+        return command("serve", **options)
+
+    def _serve(self) -> int:
+        """Serves in this process until a signal."""
         starting = contextlib.ExitStack()
         starting.enter_context(announce_progress("Loading and compiling the policy"))
         # Waking a thread costs more than it saves in one policy's inference. So JAX has no pool of
@@ -96,7 +143,12 @@ class Serve:
             )
             # Signals are not handled yet: Ctrl-C interrupts the compilation, which this contains.
             server = PolicyServer(
-                transport, self.name, source, on_answer=metrics.answer, on_batch=metrics.batch
+                transport,
+                self.name,
+                source,
+                on_answer=metrics.answer,
+                on_batch=metrics.batch,
+                workers=self.workers,
             )
             metrics.health = server.health
             with on_signal() as stop:

@@ -1,5 +1,6 @@
 """The client of a policy server, for a robot's control loop: needs only NumPy and Zenoh."""
 
+import contextlib
 import os
 import secrets
 import time
@@ -10,9 +11,17 @@ from congrasp.common.errors import RefusedError, StartingError, TransportError
 from congrasp.common.runtime import forks
 from congrasp.common.transport import urls
 from congrasp.common.transport.keys import Keys
+from congrasp.common.transport.ports import shifted
 from congrasp.common.wire.codec import Message
 from congrasp.services.client.episode_policy import EpisodePolicy
 
+WORKERS = "workers"
+"""Entry of a server's metadata: number of workers that serve the policy, on neighbouring ports from
+the server's first one on; absent for one."""
+MAX_WORKERS = 64
+"""Limit of the number of workers."""
+_WORKER_WAIT_S = 1.0
+"""Time to wait for a connection to a worker."""
 _RETRY_PAUSE_S = 0.2  # between two queries of a server that does not respond or is starting
 
 
@@ -31,6 +40,9 @@ class PolicyClient(EpisodePolicy):
     ):
         """Connects, and reconnects if the server restarts.
 
+        The first call chooses one of the server's workers (`congrasp serve --workers`) at random.
+        If that one ends, the client connects to another.
+
         Args:
           connect: the server's endpoint, such as tcp/10.0.0.7:7457.
           run: name under which the policy is served.
@@ -45,6 +57,9 @@ class PolicyClient(EpisodePolicy):
         """
         super().__init__()
         self._transport = urls.connect(connect, "client", certs=certs, wait=wait)
+        self._endpoint = connect
+        self._certs = certs
+        self._has_worker = False  # True once this client has chosen one of the server's workers
         self._keys = Keys(run)
         self._hand = hand
         self._timeout_s = timeout
@@ -122,8 +137,31 @@ class PolicyClient(EpisodePolicy):
                 f"The policy is for the hand {ascii(metadata['hand'])[:60]}, not '{self._hand}'.",
                 "Connect to a server of this hand, or pass another hand.",
             )
+        workers = metadata.pop(WORKERS, 1)
+        if not self._has_worker and isinstance(workers, int) and 1 < workers <= MAX_WORKERS:
+            self._choose_worker(workers)
+            return self._query_metadata()  # that worker may still be starting
         self._has_metadata = True
         return metadata
+
+    def _choose_worker(self, workers: int) -> None:
+        """Connects to one of the server's workers at random, with the others as alternatives.
+
+        If it does not respond, the client stays at the first one.
+        """
+        self._has_worker = True
+        chosen = secrets.randbelow(workers)
+        endpoints = [shifted(self._endpoint, (chosen + i) % workers) for i in range(workers)]
+        first = self._transport
+        with contextlib.suppress(TransportError):
+            self._transport = urls.connect(
+                endpoints[0],
+                "client",
+                certs=self._certs,
+                wait=_WORKER_WAIT_S,
+                alternatives=endpoints[1:],
+            )
+            first.close()
 
     def close(self) -> None:
         """Disconnects."""

@@ -14,6 +14,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 from congrasp.common.errors import os_errors_as
 from congrasp.common.io.opening import open_to_append
@@ -36,6 +37,8 @@ PARENT_VARIABLE = "CONGRASP_PARENT"
 """Environment variable with the parent's process number, which makes a child end with it."""
 POLL_S = 0.5
 """Time between two checks of a child."""
+MAX_PAUSE_S = 15.0
+"""Limit of the time before a restart of a child that died."""
 _KILL_TIMEOUT_S = 0.5
 """Deadline for the end of all killed children."""
 _children: weakref.WeakSet[subprocess.Popen[bytes]] = weakref.WeakSet()
@@ -204,8 +207,8 @@ class Child:
     name: str
     arguments: list[str]
     """Words of its command after `congrasp`."""
-    log: pathlib.Path
-    """File that gets its output."""
+    log: pathlib.Path | None
+    """File that gets its output; None if it writes to the output of this process."""
     environment: dict[str, str] = dataclasses.field(default_factory=dict)
     """Variables in addition to those of this process."""
     process: subprocess.Popen[bytes] | None = None
@@ -237,20 +240,34 @@ class Child:
         # frames.
         environment.setdefault("JAX_TRACEBACK_FILTERING", "off")
         self.memory_kills = _memory_kills()
-        with os_errors_as(f"{self.log} cannot be opened"):
-            log_file = open_to_append(self.log)
-        with log_file as log:
-            self.log_start = log.seek(0, os.SEEK_END)
+        with contextlib.ExitStack() as opened:
+            streams: dict[str, Any] = {}
+            if self.log is not None:
+                with os_errors_as(f"{self.log} cannot be opened"):
+                    log = opened.enter_context(open_to_append(self.log))
+                self.log_start = log.seek(0, os.SEEK_END)
+                streams = {"stdout": log, "stderr": subprocess.STDOUT}
             self.process = subprocess.Popen(
                 self.program,
-                stdout=log,
-                stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,
                 env=environment,
+                **streams,
                 **platforms.separate_session(),
             )
         _children.add(self.process)  # a forced end of this process kills it as well
         return self.process.pid
+
+    def restart(self) -> None:
+        """Starts it again after it died."""
+        self.deaths += 1
+        self.restarts += 1
+        self.again_at = 0.0
+        self.start()
+
+    @property
+    def pause(self) -> float:
+        """Seconds before its next restart: 0, 1, 3, 7, then 14."""
+        return min(2.0**self.deaths, MAX_PAUSE_S) - 1.0
 
     @property
     def code(self) -> int | None:
@@ -276,6 +293,8 @@ class Child:
 
     def _output(self) -> str:
         """Its log since it started, or the end of it."""
+        if self.log is None:
+            return "its last lines are above"
         return causes.read_end(self.log, self.log_start)
 
 

@@ -24,6 +24,7 @@ from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys, below
 from congrasp.common.transport.senders import sender
 from congrasp.common.wire.codec import Message, encode
+from congrasp.services.client.policy_client import WORKERS
 from congrasp.services.ops.logs import log
 from congrasp.services.serve.batching import Batcher, Splitting
 from congrasp.services.serve.inference import BATCH_SIZES, Inference, PolicyFunction
@@ -77,6 +78,7 @@ class PolicyServer:
         *,
         on_answer: Callable[[str, float], None] = lambda outcome, seconds: None,
         on_batch: Callable[[int], None] = lambda size: None,
+        workers: int = 1,
     ):
         """Loads the first policy and compiles; meanwhile queries get a `StartingError`.
 
@@ -88,6 +90,8 @@ class PolicyServer:
             that the transport hands over, and its duration in seconds.
           on_batch: called with the number of states of every batch. A query whose parts are
             inferred again, since the policy was swapped between them, does not count twice.
+          workers: number of servers of this policy on neighbouring ports, of which this is one
+            (`services.serve.workers`).
 
         Raises:
           CongraspError: there is no policy yet, or the name is not valid.
@@ -96,6 +100,9 @@ class PolicyServer:
         self._source = source
         self._on_answer = on_answer
         self._on_batch = on_batch
+        self._workers: dict[str, int] = {}  # entry of health and metadata, if there are several
+        if workers > 1:
+            self._workers[WORKERS] = workers
         self._batch_seconds: dict[int, float] = {}
         self._answered = 0
         self._answered_lock = threading.Lock()
@@ -159,11 +166,12 @@ class PolicyServer:
 
         `queue_limit` and `peer_limit` bound the queued queries of all peers and of one.
         `states_per_second` is the highest throughput, measured at the start. Until the server has
-        compiled, it is not ready, and `state` describes it.
+        compiled, it is not ready, and `state` describes it. `workers` is the number of workers, if
+        there are several, each with its own health.
         """
         not_ready = self._not_ready_state()
         if not_ready:
-            return {"ready": False, "state": not_ready}
+            return {"ready": False, "state": not_ready, **self._workers}
         served = self._served
         rates = [states / seconds for states, seconds in self._batch_seconds.items()]
         return {
@@ -179,6 +187,7 @@ class PolicyServer:
             "states_per_second": round(max(rates)),
             "answered": self._answered,
             "trouble": self._source_failure or self._rejection,
+            **self._workers,
         }
 
     def _describe(self, key: str, request: Message) -> Message:
@@ -186,7 +195,7 @@ class PolicyServer:
         if not request.meta.get("metadata"):
             return Message({}, self.health())
         self._check_ready()
-        return Message({}, self._function.metadata())
+        return Message({}, {**self._function.metadata(), **self._workers})
 
     def _not_ready_state(self) -> str:
         """State of a server that cannot answer queries yet; empty once it can."""

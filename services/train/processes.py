@@ -26,8 +26,6 @@ START = "start of the learner's process"
 _BAD_INPUT_CODE = 2
 _START_TIMEOUT_S = 120.0
 _POLL_S = 0.25
-MAX_PAUSE_S = 15.0
-"""Longest time before a restart."""
 Report = Callable[[dict[str, Any]], None]
 """Called several times a second with the learner's newest metrics, if any, and the number of live
 actors.
@@ -136,7 +134,7 @@ def _connect(
                 break
     if stop.is_set():
         return None
-    raise ProcessDied(f"The learner did not start: {learner.cause()}", learner.log)
+    raise _died(learner, f"The learner did not start: {learner.cause()}")
 
 
 def supervise(
@@ -210,9 +208,9 @@ def _restart_actor(child: Child, notify: Callable[[str], None]) -> None:
     if child.again_at == 0.0:
         _check_can_restart(child)
         notify(f"{child.death()} Restarting it.")
-        child.again_at = time.monotonic() + _pause(child)
+        child.again_at = time.monotonic() + child.pause
     if time.monotonic() >= child.again_at:
-        _restart(child)
+        child.restart()
 
 
 def _restart_learners(
@@ -230,32 +228,25 @@ def _restart_learners(
         _check_can_restart(child)
     restarted = "it" if len(learners) == 1 else "all ranks"
     notify(f"{deaths} Restarting {restarted}.")
-    stop.wait(_pause(learners[0]))
+    stop.wait(learners[0].pause)
     for child in learners:
         if not stop.is_set():
-            _restart(child)
-
-
-def _pause(child: Child) -> float:
-    """Seconds before the next restart of a process: 0, 1, 3, 7, then 14."""
-    return min(2.0**child.deaths, MAX_PAUSE_S) - 1.0
-
-
-def _restart(child: Child) -> None:
-    """Starts a process that died again."""
-    child.deaths += 1
-    child.restarts += 1
-    child.again_at = 0.0
-    child.start()
+            child.restart()
 
 
 def _check_can_restart(child: Child) -> None:
     """Raises a `ProcessDied` if a restart would end in the same way."""
     if child.code == _BAD_INPUT_CODE:
-        raise ProcessDied(child.death(), child.log)
+        raise _died(child, child.death())
     if child.deaths < MAX_RESTARTS:
         return
     cause = child.death()
     if child.deaths:
         cause += f" It died {child.deaths + 1} times without an update of the run between."
-    raise ProcessDied(cause, child.log)
+    raise _died(child, cause)
+
+
+def _died(child: Child, what: str) -> ProcessDied:
+    """Returns the error of a process that has ended."""
+    assert child.log is not None, "all processes of a training have logs"
+    return ProcessDied(what, child.log)

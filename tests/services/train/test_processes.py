@@ -10,6 +10,7 @@ from congrasp.common.errors import CongraspError
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.memory import MemoryHub, MemoryTransport
 from congrasp.common.wire.codec import Message
+from congrasp.services.ops import lifetime
 from congrasp.services.ops.lifetime import command
 from congrasp.services.train import accelerators, processes
 from congrasp.services.train.processes import MAX_RESTARTS, Child
@@ -117,7 +118,7 @@ def test_bad_input_of_any_rank_ends_the_run_with_its_last_words(supervise):
 @pytest.fixture
 def storm(tmp_path, monkeypatch):
     """Supervises a learner and an actor, one of which dies; progress is published or not."""
-    monkeypatch.setattr(processes, "MAX_PAUSE_S", 1.0)
+    monkeypatch.setattr(lifetime, "MAX_PAUSE_S", 1.0)
     children: list[Script] = []
 
     def run(role: str, deaths: int, *, progress: bool) -> list[str]:
