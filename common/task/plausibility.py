@@ -128,7 +128,7 @@ def sample(scene: Scene, index: Array, field: DistanceField) -> Sample:
 
 def hand_hand(hand: Hand, transforms: tuple[Array, Array]) -> Array:
     """Deepest overlap (B,) of `overlaps` in metres; 0 if there is none."""
-    return jnp.maximum(jnp.max(overlaps(hand, transforms), -1), 0.0)
+    return jnp.max(overlaps(hand, transforms), -1, initial=0.0)
 
 
 def overlaps(hand: Hand, transforms: tuple[Array, Array]) -> Array:

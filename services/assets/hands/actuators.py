@@ -19,8 +19,8 @@ _FULL_TORQUE_ERROR = 0.3
 """Error at which a joint reaches its full torque if the file has no gain, rad."""
 _MAX_DAMPING_TIME = 0.1
 """Time constant of damping, s."""
-_MIN_LEVER = 0.01
-"""Lever from which torques follow, m."""
+MIN_LEVER = 0.02
+"""Least distance of a joint from the tip that it moves, from which torques follow, m."""
 _DEFAULT_ARMATURE = 5e-4
 """Armature of a joint without one, kg.m^2."""
 _MIN_INERTIA = 1e-6
@@ -45,12 +45,13 @@ class Drive:
           model: the model.
           data: its data in the file's pose.
           joints: names of the hand's joints.
-          levers: distance of each from the tip of its finger, m.
+          levers: distance of each from the farthest tip that it moves, m; a joint that moves none
+            has those of its followers.
         """
         self.notes: list[str] = []
         self._model = model
         self._names = joints
-        self._levers = levers
+        self._levers = dict.fromkeys(joints, MIN_LEVER) | levers
         self._inertia = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, data, self._inertia)
         hand_servos = []
@@ -62,6 +63,10 @@ class Drive:
                 driven |= hand_joints
         self.links = couplings(model, {*joints}, driven, self.notes)
         self._leaders = {link.a: link for link in self.links}
+        for link in self.links:
+            if link.b not in levers:
+                lever = abs(link.ratio) * self._levers[link.a]
+                self._levers[link.b] = max(self._levers[link.b], lever)
         self._limitless: list[str] = []
         self._strong: list[str] = []
         self._damped: list[str] = []
@@ -246,7 +251,7 @@ class Drive:
         if self._model.jnt_actfrclimited[j]:
             joint_limit = float(np.abs(self._model.jnt_actfrcrange[j]).max())
             limit = min(filter(None, (limit, joint_limit)), default=0.0)
-        lever = max(self._levers[j], _MIN_LEVER)
+        lever = self._levers[j]
         if not limit:
             self._limitless.append(name)
             limit = FINGERTIP_FORCE * lever

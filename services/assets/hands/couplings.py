@@ -1,14 +1,15 @@
-"""Couplings between the joints of a model, by equalities or by tendons with narrow limits.
+"""Couplings between the joints of a model.
 
-MuJoCo reads URDF's mimic joints as joint equalities. Everything is relative to the pose of the
-file, which is zero here.
+They are equalities, closed loops of links, and tendons with narrow limits. MuJoCo reads URDF's
+mimic joints as joint equalities. Everything is relative to the pose of the file, which is zero
+here.
 """
-
-from typing import NamedTuple
 
 import numpy as np
 
 from congrasp.common.runtime.physics_library import mujoco
+from congrasp.services.assets.hands.closed_loops import loop_couplings
+from congrasp.services.assets.hands.follow import Follow
 from congrasp.services.assets.hands.tendons import fixed_tendon, relative_limits
 
 _MAX_SLACK = 0.3
@@ -17,28 +18,6 @@ _MIN_RANGE_SHARE = 0.25
 """Share of its range that a coupling leaves to a joint."""
 _CURVE_POINTS = 50
 """Points at which a polynomial coupling is linearised."""
-
-
-class Follow(NamedTuple):
-    """Joint a = offset + ratio * joint b, by their indices in the model."""
-
-    a: int
-    b: int
-    ratio: float
-    offset: float
-
-    def reversed(self) -> "Follow":
-        """Returns the same with b as the follower."""
-        return Follow(self.b, self.a, 1.0 / self.ratio, -self.offset / self.ratio)
-
-    def through(self, leader: "Follow") -> "Follow":
-        """Returns the same with the leader of b instead of b."""
-        return Follow(
-            a=self.a,
-            b=leader.b,
-            ratio=self.ratio * leader.ratio,
-            offset=self.offset + self.ratio * leader.offset,
-        )
 
 
 def couplings(
@@ -53,6 +32,9 @@ def couplings(
       notes: omissions and simplifications are appended.
     """
     by_follower = _by_follower(model, hand, driven, notes)
+    moved = driven | by_follower.keys()
+    for coupling in loop_couplings(model, hand, moved, notes):
+        by_follower[coupling.a] = coupling
     settled = []
     for coupling in by_follower.values():
         follower = model.joint(coupling.a).name
@@ -127,11 +109,7 @@ def _equalities(model: mujoco.MjModel, notes: list[str]) -> list[Follow]:
         first = int(model.eq_obj1id[e])
         has_second = int(model.eq_obj2id[e]) >= 0
         coupling = None
-        if kind == mujoco.mjtEq.mjEQ_CONNECT:
-            notes.append(
-                "closed loops of links are opened (import a URDF whose joints mimic one another)"
-            )
-        elif kind == mujoco.mjtEq.mjEQ_JOINT:
+        if kind == mujoco.mjtEq.mjEQ_JOINT:
             name = model.joint(first).name
             if has_second:
                 coupling = _joint_equality(model, e, notes)
@@ -143,7 +121,7 @@ def _equalities(model: mujoco.MjModel, notes: list[str]) -> list[Follow]:
             continue
         if coupling is not None:
             couplings.append(coupling)
-        elif kind != mujoco.mjtEq.mjEQ_CONNECT:
+        else:
             notes.append(
                 f"an equality of '{name}' that does not couple two joints is dropped ('couplings')"
             )

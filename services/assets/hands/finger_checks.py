@@ -11,6 +11,7 @@ from congrasp.common.hands import kinematics
 from congrasp.common.hands.motors import transmission
 from congrasp.common.hands.spec import Hand, chain_of
 from congrasp.services.assets.hands.findings import Finding, Verdict
+from congrasp.services.assets.hands.linkages import linkage_pairs
 
 _SIDE_BRANCH = 0.5
 """Links of a branch without a tip, as a share of those of the finger next to it, up to which it is
@@ -45,12 +46,16 @@ def finger_findings(hand: Hand) -> list[Finding]:
 
 
 def _links_without_tip(hand: Hand) -> list[Finding]:
-    """Findings on last links that carry no tip; short branches of a finger are doubtful."""
+    """Findings on last links that carry no tip; short branches of a finger are doubtful.
+
+    Links that drive a finger from beside it need none.
+    """
+    driving = {link for link, _ in linkage_pairs(hand)}
     parents = {link.parent for link in hand.links}
     tips = [hand.links[i].name for i in hand.tip_links]
     findings = []
     for link in hand.links:
-        if link.name in parents or link.name in tips:
+        if link.name in parents or link.name in tips or link.name in driving:
             continue
         verdict: Verdict = "doubt" if _is_side_branch(hand, link.name) else "failed"
         findings.append(

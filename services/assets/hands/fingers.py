@@ -9,6 +9,7 @@ import functools
 import numpy as np
 
 from congrasp.common.runtime.physics_library import mujoco
+from congrasp.services.assets.hands.closed_loops import tied_bodies
 from congrasp.services.assets.hands.links import Tree
 from congrasp.services.assets.hands.reading import listed
 
@@ -111,9 +112,7 @@ def _tied_links(tree: Tree) -> list[tuple[int, int]]:
     model = tree.model
     pairs = []
     for equality in np.flatnonzero(np.isin(model.eq_type, _LOOPS) & model.eq_active0):
-        bodies = [int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])]
-        if model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE:
-            bodies = model.site_bodyid[bodies].tolist()
+        bodies = tied_bodies(model, int(equality))
         if not all(body in tree.owner for body in bodies):
             continue
         first, second = (tree.owner[body] for body in bodies)

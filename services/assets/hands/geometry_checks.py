@@ -17,6 +17,7 @@ from congrasp.common.objects.spec import GraspObject
 from congrasp.common.task import plausibility
 from congrasp.common.task.settings import GRAVITY
 from congrasp.services.assets.hands.findings import Finding, Limits, finding_of, worst
+from congrasp.services.assets.hands.linkages import linkage_pairs
 
 OVERLAP = Limits(0.004, 0.012)
 """Overlap of links, m."""
@@ -268,14 +269,16 @@ def strength_finding(hand: Hand) -> Finding:
 def open_overlap_finding(hand: Hand) -> Finding:
     """Checks that different fingers of the open hand do not overlap.
 
-    Housings of one finger may nest at knuckles.
+    Housings of one finger may nest at knuckles, and a linkage at its pins.
     """
+    pinned = linkage_pairs(hand)
     names = [link.name for link in hand.links]
     depths = np.asarray(_depths(hand, np.array(hand.q_open, np.float32)))
     deepest = 0.0
     pair = ""
     for first, second in overlapping(hand):
-        if _are_of_one_finger(hand, first, second):
+        is_pinned = (first, second) in pinned or (second, first) in pinned
+        if is_pinned or _are_of_one_finger(hand, first, second):
             continue
         first_capsules = np.flatnonzero(hand.capsule_links == names.index(first))
         second_capsules = np.flatnonzero(hand.capsule_links == names.index(second))

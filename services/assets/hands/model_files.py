@@ -24,6 +24,7 @@ from congrasp.services.assets.hands.links import Tree, hand_tree, identifier
 from congrasp.services.assets.hands.poses import opening, propose_poses, thumb_of
 from congrasp.services.assets.hands.proposed_links import proposed_links
 from congrasp.services.assets.hands.reading import confined, listed
+from congrasp.services.assets.hands.slides import slides_of, with_hinges
 from congrasp.services.assets.hands.units import MAX_LINK, check_size, check_units
 from congrasp.services.assets.hands.urdf_inertias import LEAST_MASS
 
@@ -85,12 +86,15 @@ def propose(path: pathlib.Path, choices: Choices = _GUESSED) -> Proposal:
         guessed; collision.
 
     Raises:
-      CongraspError: the file cannot be read, is not a hand of hinges with at least two fingers, or
-        has sizes, ranges or masses of another unit.
+      CongraspError: the file cannot be read, is not a hand of hinges and slides with at least two
+        fingers, or has sizes, ranges or masses of another unit.
     """
     notes: list[str] = []
-    _, model = robot_spec(path, notes)
+    spec, model = robot_spec(path, notes)
     tree = hand_tree(model, choices.palm, notes)
+    if slides_of(tree):
+        model = with_hinges(path, spec, tree, notes)
+        tree = hand_tree(model, choices.palm, notes)
     palm = model.body(tree.palm).name
     ends = finger_ends(tree, notes)
     _check_fingers(path, tree, ends)

@@ -33,6 +33,8 @@ _OPENING = 1.25
 """Distance between the tips of an open hand in finger lengths; or as a share of that at zero, if
 smaller.
 """
+_GRIPPER_OPENING = 4.0
+"""The same in finger lengths for a gripper: wider than it opens."""
 _MIN_AHEAD = 0.3
 """Distance of the tips of an open hand ahead of the fingers' bases, in finger lengths."""
 _MIN_TOWARDS = 0.6
@@ -327,6 +329,8 @@ class _Body:
 def _open_hand(body: _Body, random_starts: int) -> _OpenHand:
     """The open hand: thumb and fingers face each other across the opening.
 
+    A gripper, whose two fingers have a motor each or share one, opens as wide as it can.
+
     Args:
       body: the hand.
       random_starts: starts of the search in addition to the standard ones.
@@ -338,12 +342,19 @@ def _open_hand(body: _Body, random_starts: int) -> _OpenHand:
     share, _ = body.closing(0.5 * (flat + pinch))
     flexes = ~body.thumb & (share * np.sign(closing_way) > _MIN_TOWARDS)
     closed_end = np.where(closing_way > 0, upper, lower)
-    rest = np.where(flexes, flat + _FLEXED * (closed_end - flat), flat)
+    is_gripper = len(body.roots) == 2 and len(lower) <= 2
+    rest = flat
+    if not is_gripper:
+        rest = np.where(flexes, flat + _FLEXED * (closed_end - flat), flat)
     # Fingers spread only if it helps
     weight = np.where(body.thumb, 4.0, np.where(flexes, 8.0, 24.0))
     straight = body.tips(flat)
     straight_opening = float(np.linalg.norm(straight[1:].mean(0) - straight[0]))
     target = _OPENING * min(1.0, straight_opening / body.size)
+    facing_weight = 0.5
+    if is_gripper:
+        target = _GRIPPER_OPENING
+        facing_weight = 0.0
 
     def residuals(motors: np.ndarray) -> np.ndarray:
         """Residuals of the pads' directions, the tips' positions, and the motion from rest."""
@@ -353,7 +364,7 @@ def _open_hand(body: _Body, random_starts: int) -> _OpenHand:
         distance = float(np.linalg.norm(between))
         thumb_facing = pads[0] - between / distance
         fingers_facing = (pads[1:] + between / distance) / np.sqrt(len(pads) - 1)
-        facing = 0.5 * np.concatenate([thumb_facing, *fingers_facing])
+        facing = facing_weight * np.concatenate([thumb_facing, *fingers_facing])
         lateral = (between - body.across @ between) / body.size
         behind = np.maximum(_MIN_AHEAD - (tips - body.roots) @ body.ahead / body.size, 0.0)
         opening_error = [distance / body.size - target]

@@ -7,13 +7,11 @@ from congrasp.common.hands.files import RESERVED_JOINTS
 from congrasp.common.hands.spec import Capsule, Joint, Link, vector
 from congrasp.common.io.inputs import distinct_names
 from congrasp.common.runtime.physics_library import mujoco
-from congrasp.services.assets.hands.actuators import Drive
+from congrasp.services.assets.hands.actuators import MIN_LEVER, Drive
 from congrasp.services.assets.hands.capsules import bare, far_end, fit_capsules, inertia_boxes
 from congrasp.services.assets.hands.links import Tree, identifier, renamed
 from congrasp.services.assets.hands.reading import listed
 
-_MIN_LEVER = 0.02
-"""Distance of a joint from the tip that it moves, m."""
 _MIN_MASS = 1e-3
 """Mass of a link without any, kg."""
 _TIP_CONTACT_WEIGHT = 3.0
@@ -34,7 +32,7 @@ def proposed_links(
       notes: proposals are appended.
 
     Raises:
-      CongraspError: a joint is not a hinge, or has no limits.
+      CongraspError: a joint is neither a hinge nor a slide, or has no limits.
     """
     anchors = {link: _anchor(tree, link) for link in tree.groups}
     geometry_notes: list[str] = []
@@ -113,15 +111,13 @@ def _joint_names(tree: Tree, notes: list[str]) -> dict[int, str]:
 
 
 def _levers(tree: Tree, tips: dict[int, np.ndarray]) -> dict[int, float]:
-    """Distance of each joint of the hand from the farthest tip that it moves, m."""
+    """Distance of each joint that moves a tip from the farthest of them, m."""
     levers: dict[int, float] = {}
-    for link in tree.groups:
-        levers |= dict.fromkeys(tree.joints(link), _MIN_LEVER)
     for link, tip in tips.items():
         while link != tree.palm:
             for j in tree.joints(link):
                 distance = float(np.linalg.norm(tree.data.xanchor[j] - tip))
-                levers[j] = max(levers[j], distance)
+                levers[j] = max(levers.get(j, MIN_LEVER), distance)
             link = tree.above(link)
     return levers
 
@@ -130,8 +126,8 @@ def _joint(tree: Tree, j: int, name: str, drive: Drive) -> Joint:
     """A hinge with its limits and gains."""
     if tree.model.jnt_type[j] != mujoco.mjtJoint.mjJNT_HINGE:
         raise CongraspError(
-            f"The joint '{name}' is not a hinge.",
-            "Remove it or fix it: only hands with hinge joints can be imported.",
+            f"The joint '{name}' is neither a hinge nor a slide with a range.",
+            "Remove it or fix it: only hands with such joints can be imported.",
         )
     limits = drive.limits(j)
     if limits is None:

@@ -66,6 +66,10 @@ _REBUILT_OFFSET = 0.55
 """Distance of a rebuilt surface from the mesh, in cells: CoACD's level set."""
 _REBUILT_COARSENESS = 4 / 3
 """Depth for a rebuilt surface, relative to another one's."""
+_REBUILT_SEARCH = _SEARCH | {"resolution": 4500}
+"""Work of CoACD for each cut of a rebuilt surface. More samples lower the noise of distances, which
+asks for further cuts.
+"""
 _MAX_VHACD_HULLS = 1 << 20
 _PACKAGES = {"coacd": "coacd", "vhacd": "vhacdx"}
 """Package of each decomposer."""
@@ -287,7 +291,7 @@ def _rebuilt_by_coacd(vertices: np.ndarray, faces: np.ndarray, depth: float) -> 
         preprocess_resolution=_REBUILT_CELLS,
         merge=False,
         seed=0,
-        **_SEARCH,
+        **_REBUILT_SEARCH,
     )
     return [piece[0] for piece in pieces]
 

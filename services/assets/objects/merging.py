@@ -298,13 +298,17 @@ def _separates(hull: ConvexHull, other: ConvexHull) -> bool:
 
 
 def _sort_by_x(points: np.ndarray) -> np.ndarray:
-    """Points (N, 3) in the order of their first coordinate."""
-    return points[np.argsort(points[:, 0])]
+    """Points (N, 3) in the order of their first coordinate; each coordinate is contiguous."""
+    return np.asfortranarray(points[np.argsort(points[:, 0])])
 
 
 def _in_box(hull: ConvexHull, points: np.ndarray) -> np.ndarray:
     """Points inside the hull's bounding box, of sorted points (N, 3)."""
-    start, end = np.searchsorted(points[:, 0], [hull.min_bound[0], hull.max_bound[0]])
+    low = hull.min_bound
+    high = hull.max_bound
+    start = np.searchsorted(points[:, 0], low[0], side="right")
+    end = np.searchsorted(points[:, 0], high[0], side="left")
     candidates = points[start:end]
-    inside = (candidates > hull.min_bound) & (candidates < hull.max_bound)
-    return candidates[inside.all(-1)]
+    _, y, z = candidates.T
+    inside = (y > low[1]) & (y < high[1]) & (z > low[2]) & (z < high[2])
+    return np.ascontiguousarray(candidates[inside])
