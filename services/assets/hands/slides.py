@@ -12,10 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from congrasp.common.errors import CongraspError
 from congrasp.common.runtime.physics_library import mujoco
 from congrasp.services.assets.hands.link_geometry import placed
 from congrasp.services.assets.hands.links import Tree
 from congrasp.services.assets.hands.reading import listed
+from congrasp.services.assets.hands.units import MAX_LINK
 
 _TURN = 0.25
 """Angle by which a hinge turns over the range of its slide, rad: the arc is 3 % as high as long."""
@@ -67,7 +69,11 @@ def with_hinges(
       spec: the modifiable model, which is changed.
       tree: the hand in the compiled model.
       notes: the slides are appended.
+
+    Raises:
+      CongraspError: a slide is longer than any hand's.
     """
+    _check_lengths(tree)
     data = mujoco.MjData(tree.model)
     mujoco.mj_kinematics(tree.model, data)
     slides = [_slide(tree, data, joint) for joint in slides_of(tree)]
@@ -93,6 +99,22 @@ def with_hinges(
         [slide.name for slide in slides],
     )
     return model
+
+
+def _check_lengths(tree: Tree) -> None:
+    """Checks that slides are as long as those of hands.
+
+    Raises:
+      CongraspError: one is not.
+    """
+    for joint in slides_of(tree):
+        length = float(np.ptp(tree.model.jnt_range[joint]))
+        if length > MAX_LINK:
+            name = tree.model.joint(joint).name or f"joint_{joint}"
+            raise CongraspError(
+                f"The joint '{name}' slides by {length:.3g} m, which is no hand's.",
+                "Give its range in metres, or make it a hinge.",
+            )
 
 
 def _slide(tree: Tree, data: mujoco.MjData, joint: int) -> _Slide:
