@@ -17,7 +17,7 @@ BALL = plain_object("ball", (Piece("ellipsoid", (0.03, 0.03, 0.03)),), 500.0)
 def test_captured_posture_counts_fingers_without_contact_as_idle():
     q = np.tile(HUMAN.q_open, (2, 1))
     index_pip = [joint.name for joint in HUMAN.joints].index("index_pip")
-    q[:, index_pip] = 1.6
+    q[:, index_pip] = 1.0
     links = len(HUMAN.links)
     index_tip = np.asarray(keypoints(HUMAN, link_transforms(HUMAN, q[0])))[links + 1]
     far_away = np.array([1.0, 0.0, 0.0])
