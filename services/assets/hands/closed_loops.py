@@ -75,9 +75,12 @@ def loop_couplings(
     for equality in np.flatnonzero(is_connection & (model.eq_active0 > 0)):
         already_moved = moved | {coupling.a for coupling in couplings}
         loop = _loop(model, int(equality), hand, already_moved)
-        loop_couplings = _followers(model, loop) if loop else []
-        couplings += loop_couplings
-        left_open |= not loop_couplings
+        if loop is None:
+            left_open = True
+            continue
+        followers = _followers(model, loop)
+        couplings += followers
+        left_open |= not followers
     names = [model.joint(coupling.a).name for coupling in couplings]
     notes += listed("closed loops of links are replaced by joints that follow", names)
     if left_open:
