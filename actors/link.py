@@ -34,6 +34,7 @@ from congrasp.common.wire.codec import Message, SharedMessage, checksum
 _POLL_S = 0.2
 _CONFIG_TIMEOUT_S = 1.0
 """Deadline of a request for the configuration, after which a stop is noticed."""
+_NO_ANSWER_YET = "The learner has not answered yet, perhaps because it is starting"
 _TICKET_TIMEOUT_S = 60.0
 """Deadline of a ticket that is requested in the background."""
 _MAX_TICKETS_AHEAD = 4
@@ -189,7 +190,7 @@ class ActorLink(Closing):
             except RefusedError:
                 raise
             except TransportError as error:
-                self._patience.check(self._answered, error)
+                self._patience.check(self._answered, error, _NO_ANSWER_YET)
         return None
 
     def acquire_ticket(self, timeout: float) -> Ticket | None:

@@ -48,12 +48,18 @@ class Patience:
             self._read = now
             return self._seconds
 
-    def check(self, answered: float, error: TransportError) -> None:
+    def check(
+        self,
+        answered: float,
+        error: TransportError,
+        situation: str = "The learner does not answer",
+    ) -> None:
         """Logs a silence of the learner, at most once a minute.
 
         Args:
           answered: time of its last reply, by `now`.
           error: error of the latest query.
+          situation: beginning of the line.
 
         Raises:
           TransportError: the silence exceeds the limit.
@@ -68,7 +74,7 @@ class Patience:
         if silence > NOTICED_S and now - self._noticed > _NOTICE_AGAIN_S:
             self._noticed = now
             limit = "" if math.isinf(self.limit) else f" for up to {self.limit:g} s"
-            _log.warning("The learner does not answer; waiting%s: %s", limit, error)
+            _log.warning("%s; waiting%s: %s", situation, limit, error)
 
 
 def backoff() -> Iterator[float]:

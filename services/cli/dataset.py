@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import pathlib
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
@@ -10,9 +11,11 @@ import tyro
 from congrasp.actors.physics import PhysicsName
 from congrasp.common.errors import CongraspError
 from congrasp.services.assets.objects.options import ImportOptions
-from congrasp.services.cli.console import in_range, tracked
+from congrasp.services.cli.console import PhaseBar, bars, in_range
 
 if TYPE_CHECKING:
+    from rich.progress import Progress
+
     from congrasp.common.task.config import TaskConfig
     from congrasp.services.assets.objects.named import ObjectAt
     from congrasp.services.dataset.make import Recipe
@@ -95,13 +98,13 @@ class Dataset:
             write_card(shards, recipe.about, facts)
         of_part = range(first_shard, shards.total, parts)
         missing = [number for number in of_part if number not in finished]
-        with tracked() as track:
-            objects = min(len(recipe.objects), pools.pool_size * len(missing))
-            advance = track("Episodes", objects * self.per_object)
+        objects = min(len(recipe.objects), pools.pool_size * len(missing))
+        with bars() as display:
+            progress = _episode_progress(display, objects * self.per_object)
             if gpus is None or not missing:
-                make(recipe, shards, pools, missing, advance)
+                make(recipe, shards, pools, missing, progress)
             else:
-                make_on_gpus(recipe, shards, missing, gpus.names, advance)
+                make_on_gpus(recipe, shards, missing, gpus.names, progress)
         card = write_card(shards, recipe.about, facts)
         counts = card["counts"].values()
         episodes = sum(count["episodes"] for count in counts)
@@ -182,6 +185,29 @@ def _part(text: str) -> tuple[int, int]:
     if slash and part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts):
         return int(part) - 1, int(parts)
     raise CongraspError(f"--part is '{text}'.", "Write K/N with K from 1 to N: --part 3/20")
+
+
+def _episode_progress(display: "Progress", total: int) -> Callable[[int], None]:
+    """Shows that shards are prepared and, from the first episode on, how many are simulated.
+
+    Args:
+      display: the bars.
+      total: number of all episodes.
+
+    Returns:
+      Function to call with the number of simulated episodes.
+    """
+    preparations = "Preparing objects, references and programs"
+    bar = PhaseBar(display, preparations)
+
+    def progress(episodes: int) -> None:
+        """Shows the number of simulated episodes."""
+        if episodes:
+            bar.update("Episodes", episodes, total)
+        else:
+            bar.update(preparations, 0, 0)
+
+    return progress
 
 
 COMMAND = Dataset

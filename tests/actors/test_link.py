@@ -291,6 +291,19 @@ def test_one_line_is_logged_while_a_learner_does_not_answer(joined, monkeypatch,
     assert line.startswith("The learner does not answer; waiting for up to 20 s: No response for ")
 
 
+def test_the_line_before_the_first_answer_does_not_say_that_the_learner_stopped(
+    ends, monkeypatch, caplog
+):
+    monkeypatch.setattr(patience_module, "NOTICED_S", 0.2)
+    _, make = ends
+    link = make(patience=20.0)
+    stop = threading.Event()
+    threading.Timer(1.5, stop.set).start()
+    assert link.wait_for_config(stop) is None
+    (line,) = (record.getMessage() for record in caplog.records)
+    assert line.startswith("The learner has not answered yet, perhaps because it is starting; ")
+
+
 def test_a_suspended_actor_does_not_count_as_silence(joined, monkeypatch):
     learner, link = joined(patience=5.0)
     learner.transport.close()
