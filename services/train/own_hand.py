@@ -39,7 +39,7 @@ _STAGE_TIMEOUT_S = 1800.0
 _LINE_INTERVAL_S = 10.0
 """Time between two lines about the training's progress."""
 _FULL_TASK_UPDATES = 560
-"""With check and report, some 15 minutes of one H200."""
+"""With check and report, some 20 minutes of one H200."""
 _H200_STEPS_PER_S = 350_000
 """Trained steps per second of one H200."""
 
