@@ -6,7 +6,7 @@ import re
 import secrets
 import socket
 
-from congrasp.common.errors import CongraspError
+from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.runtime.platforms import reserve_for_listener
 from congrasp.common.transport.keys import FLOWS
 
@@ -62,6 +62,24 @@ def host_of(url: str) -> tuple[str, int] | None:
         return None
     host = match["address"].partition("/")[2]
     return host.strip("[]"), int(match["port"])
+
+
+def check_host(url: str) -> None:
+    """Raises a `TransportError` if the name of a URL's host cannot be resolved, on which Zenoh
+    would wait in silence.
+    """
+    address = host_of(url)
+    if address is None:
+        return
+    host, port = address
+    try:
+        socket.getaddrinfo(host, port)
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise TransportError(
+            f"The host name '{host}' of {url} cannot be resolved: {reason}.",
+            "Correct the name, or pass the host's address.",
+        ) from None
 
 
 def check_ports(url: str, count: int = len(FLOWS)) -> None:

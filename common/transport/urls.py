@@ -17,7 +17,7 @@ from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import FLOWS, Flow
 from congrasp.common.transport.memory import connect_in_memory, listen_in_memory
 from congrasp.common.transport.ports import LEARNER_URL
-from congrasp.common.transport.security import Credentials, check_exposure, numbered
+from congrasp.common.transport.security import Credentials, check_exposure, numbered, secured
 
 Listener = Literal["learner", "server"]
 Peer = Literal["actor", "server", "client", "observer"]
@@ -79,7 +79,7 @@ def connect(
       wait: seconds to wait for a listener.
       run: required run of the certificate.
       alternatives: URLs of listeners that can replace this one: a lost connection is reopened to
-        the first of all that responds.
+        the first of all that responds. The first connection is only to `url`.
 
     Raises:
       CongraspError: the URL is malformed; or the certificates are missing, expired, not accepted,
@@ -120,6 +120,20 @@ def listen(
     return _open(
         Endpoint(url, role, True, certs, insecure, run=run, longest_rollout=longest_rollout)
     )
+
+
+def check_listener(
+    url: str, role: Listener, *, certs: Certs = None, insecure: bool = False, run: str | None = None
+) -> None:
+    """Checks the arguments of `listen` without listening, for a Zenoh URL.
+
+    Raises:
+      CongraspError: it is exposed to other machines without protection, or needs certificates; or
+        these are missing, expired, or of another role or run.
+    """
+    credentials = find_credentials(certs, role, run)
+    check_exposure(url, credentials, insecure=insecure)
+    secured(url, credentials)
 
 
 def find_credentials(certs: Certs, role: str, run: str | None = None) -> Credentials | None:

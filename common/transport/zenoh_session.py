@@ -16,7 +16,6 @@ import json
 import logging
 import os
 import re
-import socket
 import struct
 import threading
 import time
@@ -30,7 +29,7 @@ from congrasp.common.errors import CongraspError, TransportError
 from congrasp.common.runtime import forks, platforms
 from congrasp.common.transport.base import Subscription, join
 from congrasp.common.transport.keys import Flow
-from congrasp.common.transport.ports import host_of, port_in_use
+from congrasp.common.transport.ports import check_host, port_in_use
 from congrasp.common.transport.security import Credentials, limits, refusal
 from congrasp.common.wire.codec import Message, decode
 
@@ -196,15 +195,16 @@ def connect(
         listen for this run.
     """
     for endpoint in endpoints:
-        _check_host(endpoint)
+        check_host(endpoint)
     while True:
         try:
             session = _open(config)
             break
         except zenoh.ZError as error:
-            refusals = [refusal(endpoint, credentials) for endpoint in endpoints]
-            if all(refusals) and refusals[0]:
-                raise refusals[0] from None
+            first_refusal = refusal(endpoints[0], credentials)
+            others = endpoints[1:]
+            if first_refusal and all(refusal(other, credentials) for other in others):
+                raise first_refusal from None
             if time.monotonic() >= deadline:
                 where = ", ".join(endpoints)
                 remedy = "Start the learner or the server there, or correct the address."
@@ -239,24 +239,6 @@ def _open(config: zenoh.Config) -> zenoh.Session:
     """Opens a session, and with the first one Zenoh's threads."""
     forks.note_started("Zenoh")
     return zenoh.open(config)
-
-
-def _check_host(endpoint: str) -> None:
-    """Raises a `TransportError` if the name of an endpoint's host cannot be resolved, on which
-    Zenoh would wait in silence.
-    """
-    address = host_of(endpoint)
-    if address is None:
-        return
-    host, port = address
-    try:
-        socket.getaddrinfo(host, port)
-    except (OSError, UnicodeError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise TransportError(
-            f"The host name '{host}' of {endpoint} cannot be resolved: {reason}.",
-            "Correct the name, or pass the host's address.",
-        ) from None
 
 
 def first_line(error: Exception) -> str:

@@ -92,8 +92,8 @@ class ZenohTransport(Transport):
         """Opens the sessions.
 
         Args:
-          connect: endpoints to connect to, such as `tcp/192.168.0.5:7447`; the first that responds
-            is used, and reconnected whenever it returns.
+          connect: endpoints to connect to, such as `tcp/192.168.0.5:7447`. Zenoh opens a session to
+            the first, and reopens a lost one to the first of all that responds.
           listen: endpoints to listen on instead.
           flows: flows to open; flow i uses the port i above the endpoint's, so the flows of both
             ends must start alike.

@@ -10,8 +10,8 @@ import tyro
 from congrasp.common.errors import TransportError
 from congrasp.common.transport.ports import SERVER_URL
 from congrasp.services.cli.console import in_range
+from congrasp.services.client.joint_health import joint_health
 from congrasp.services.client.policy_client import PolicyClient
-from congrasp.services.client.workers import joint_health
 
 if TYPE_CHECKING:
     from congrasp.services.serve.load import Example

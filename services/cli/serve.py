@@ -14,7 +14,7 @@ from congrasp.common.transport import urls
 from congrasp.common.transport.keys import Keys
 from congrasp.common.transport.ports import SERVER_URL, check_ports, shifted
 from congrasp.services.cli.console import in_range
-from congrasp.services.client.policy_client import MAX_WORKERS
+from congrasp.services.client.worker_endpoints import MAX_WORKERS
 from congrasp.services.ops.lifetime import Stop, command, on_signal
 from congrasp.services.ops.logs import MonitoringOptions, announce_progress, log, logging_as
 from congrasp.services.ops.metrics import ServerMetrics
@@ -46,7 +46,7 @@ class Serve:
     """Name of the learner's run, with --connect."""
     patience: float | None = None
     """Seconds for which the server waits for the learner of --connect when it starts; without
-    limit by default."""
+    limit by default. A worker that is restarted waits without limit, since the others serve."""
     listen: str = SERVER_URL
     """Endpoint for clients."""
     name: str = "policy"
@@ -61,13 +61,19 @@ class Serve:
     workers: int = 1
     """Number of processes that serve the policy, if one core is the limit. Each listens on its own
     port, from that of --listen on; --metrics-port counts up likewise. Clients that connect to the
-    first one are distributed over all."""
+    first one are distributed over all. With --certs all have the same certificate. With --connect
+    each has its own connection to the learner."""
     worker: int | None = None
     """Only run the worker of this number, from 0 on, without the process that restarts workers."""
 
     def __call__(self) -> int:
         """Serves until a signal."""
         in_range(1, MAX_WORKERS, workers=self.workers)
+        if self.policy is not None and self.connect:
+            raise CongraspError(
+                f"The server can follow either {self.policy} or {self.connect}.",
+                "Pass one of --policy and --connect.",
+            )
         if self.worker is not None:
             in_range(0, self.workers - 1, worker=self.worker)
             return self._as_worker(self.worker)._serve()
@@ -86,6 +92,13 @@ class Serve:
     def _serve_with_workers(self) -> int:
         """Runs the workers until a signal."""
         check_ports(self.listen, self.workers)
+        urls.check_listener(
+            self.listen,
+            "server",
+            certs=self.certs,
+            insecure=self.insecure,
+            run=self.run if self.connect else None,
+        )
         workers = [worker_of(i, self._worker_arguments(i)) for i in range(self.workers)]
         run = self.run if self.connect else ""
         log_format = self.monitoring.log_format
@@ -117,11 +130,6 @@ class Serve:
         from congrasp.services.serve.server import PolicyServer
         from congrasp.services.serve.sources import follow_file
 
-        if self.policy is not None and self.connect:
-            raise CongraspError(
-                f"The server can follow either {self.policy} or {self.connect}.",
-                "Pass one of --policy and --connect.",
-            )
         jax.config.update("jax_cpu_enable_async_dispatch", False)
         metrics = ServerMetrics()
         run = self.run if self.connect else ""
@@ -149,6 +157,7 @@ class Serve:
                 on_answer=metrics.answer,
                 on_batch=metrics.batch,
                 workers=self.workers,
+                worker=self.worker or 0,
             )
             metrics.health = server.health
             with on_signal() as stop:

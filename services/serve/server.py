@@ -24,7 +24,7 @@ from congrasp.common.transport.base import Transport
 from congrasp.common.transport.keys import Keys, below
 from congrasp.common.transport.senders import sender
 from congrasp.common.wire.codec import Message, encode
-from congrasp.services.client.policy_client import WORKERS
+from congrasp.services.client.worker_endpoints import WORKER, WORKERS
 from congrasp.services.ops.logs import log
 from congrasp.services.serve.batching import Batcher, Splitting
 from congrasp.services.serve.inference import BATCH_SIZES, Inference, PolicyFunction
@@ -79,6 +79,7 @@ class PolicyServer:
         on_answer: Callable[[str, float], None] = lambda outcome, seconds: None,
         on_batch: Callable[[int], None] = lambda size: None,
         workers: int = 1,
+        worker: int = 0,
     ):
         """Loads the first policy and compiles; meanwhile queries get a `StartingError`.
 
@@ -92,6 +93,7 @@ class PolicyServer:
             inferred again, since the policy was swapped between them, does not count twice.
           workers: number of servers of this policy on neighbouring ports, of which this is one
             (`services.serve.workers`).
+          worker: its number, from 0 on.
 
         Raises:
           CongraspError: there is no policy yet, or the name is not valid.
@@ -100,9 +102,9 @@ class PolicyServer:
         self._source = source
         self._on_answer = on_answer
         self._on_batch = on_batch
-        self._workers: dict[str, int] = {}  # entry of health and metadata, if there are several
+        self._workers: dict[str, int] = {}  # entries of health and metadata, if there are several
         if workers > 1:
-            self._workers[WORKERS] = workers
+            self._workers = {WORKERS: workers, WORKER: worker}
         self._batch_seconds: dict[int, float] = {}
         self._answered = 0
         self._answered_lock = threading.Lock()
@@ -166,8 +168,8 @@ class PolicyServer:
 
         `queue_limit` and `peer_limit` bound the queued queries of all peers and of one.
         `states_per_second` is the highest throughput, measured at the start. Until the server has
-        compiled, it is not ready, and `state` describes it. `workers` is the number of workers, if
-        there are several, each with its own health.
+        compiled, it is not ready, and `state` describes it. If there are several workers, `workers`
+        is their number and `worker` the number of the one with this health.
         """
         not_ready = self._not_ready_state()
         if not_ready:

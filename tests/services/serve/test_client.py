@@ -10,10 +10,11 @@ from congrasp.common.hands import get_hand
 from congrasp.common.request import GraspRequest
 from congrasp.common.task.config import TaskConfig
 from congrasp.common.transport.keys import Keys, below
-from congrasp.common.transport.ports import free_port
+from congrasp.common.transport.ports import free_port, shifted
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message
 from congrasp.services.client.policy_client import PolicyClient
+from congrasp.services.client.worker_endpoints import worker_endpoints
 from congrasp.services.serve.inference import Inference, PolicyFunction
 from tests.waits import eventually
 
@@ -141,6 +142,29 @@ def test_another_server_with_the_policy_of_another_hand_is_refused(endpoint):
                 RefusedError, match="The policy is for the hand 'allegro', not 'human'"
             ):
                 ask()
+    server.close()
+
+
+@pytest.mark.parametrize(
+    ("health", "ports"),
+    [
+        ({}, [7458]),
+        ({"workers": 3, "worker": 1}, [7457, 7458, 7459]),
+        ({"workers": 2}, [7458, 7459]),
+        ({"workers": 3, "worker": 3}, [7458]),
+        ({"workers": "3"}, [7458]),
+    ],
+)
+def test_endpoints_of_workers(health, ports):
+    endpoints = worker_endpoints("tcp/10.0.0.7:7458", health)
+    assert endpoints == [f"tcp/10.0.0.7:{port}" for port in ports]
+
+
+def test_another_server_on_the_next_port_is_not_used(endpoint):
+    server = CannedServer(shifted(endpoint, 1))
+    with pytest.raises(TransportError, match=f"No response from {endpoint}"):
+        PolicyClient(endpoint, wait=0.5)
+    assert server.described == 1
     server.close()
 
 

@@ -1,6 +1,7 @@
 """Several processes that serve one policy."""
 
 import contextlib
+import dataclasses
 import json
 import pathlib
 import signal
@@ -14,11 +15,14 @@ import pytest
 
 from congrasp.common.errors import TransportError
 from congrasp.common.policy import bundle as bundles
-from congrasp.common.transport.ports import free_port, shifted
+from congrasp.common.transport import urls
+from congrasp.common.transport.ports import free_port, local_url, shifted
 from congrasp.services.client.policy_client import PolicyClient
+from congrasp.services.ops.certificates import create_authority, issue
 from congrasp.services.ops.lifetime import command
 from tests import task
 from tests.children import following
+from tests.rollouts import learner_hub
 from tests.services.ops.test_metrics import scrape
 from tests.waits import eventually
 
@@ -69,24 +73,32 @@ def serving(folder, **options) -> Iterator[Served]:
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory):
+def server(tmp_path_factory):
     folder = tmp_path_factory.mktemp("policy")
     path = folder / "policy.safetensors"
     bundles.save(task.policy(), path)
     with serving(folder, policy=path) as server:
-        for number in range(WORKERS):
-            with PolicyClient(shifted(server.endpoint, number), wait=WAIT_S) as client:
-                eventually(lambda client=client: client.wait_until_ready())
         yield server
 
 
 @pytest.fixture
+def served(server):
+    """The module's server, all of whose workers are ready."""
+    for number in range(WORKERS):
+        ready_health(server, number)
+    return server
+
+
+@pytest.fixture
 def client_of(served, example, monkeypatch):
-    """Makes clients that choose a certain worker, at the start of an episode."""
+    """Makes clients whose order begins with a certain worker, at the start of an episode."""
     with contextlib.ExitStack() as clients:
 
         def connect(number):
-            monkeypatch.setattr("secrets.randbelow", lambda count: number)
+            monkeypatch.setattr(
+                "secrets.SystemRandom.sample",
+                lambda _, endpoints, k: [*endpoints[number:], *endpoints[:number]],
+            )
             client = clients.enter_context(PolicyClient(served.endpoint, wait=WAIT_S))
             client.reset(example.request)
             return client
@@ -94,10 +106,46 @@ def client_of(served, example, monkeypatch):
         yield connect
 
 
+def health_of_worker(served, number, **options):
+    """Health of a worker; None if it does not respond."""
+    endpoint = shifted(served.endpoint, number)
+    with (
+        contextlib.suppress(TransportError),
+        PolicyClient(endpoint, wait=WAIT_S, **options) as client,
+    ):
+        health = client.health()
+        if health["worker"] == number:
+            return health
+
+
+def ready_health(served, number):
+    """Health of a worker, once it is ready."""
+
+    def health():
+        health = health_of_worker(served, number)
+        if health and health["ready"]:
+            return health
+
+    return eventually(health)
+
+
 def answered(served, number):
     """Number of queries that a worker has answered."""
-    with PolicyClient(shifted(served.endpoint, number), wait=WAIT_S) as client:
-        return client.wait_until_ready()["answered"]
+    return ready_health(served, number)["answered"]
+
+
+@contextlib.contextmanager
+def without_worker(served, number) -> Iterator[None]:
+    """Context in which a worker is killed, and not replaced before its end."""
+    restarter = psutil.Process(served.process.pid)
+    restarter.suspend()
+    try:
+        killed = served.worker(number)
+        killed.kill()
+        eventually(lambda: killed.status() == psutil.STATUS_ZOMBIE)
+        yield
+    finally:
+        restarter.resume()
 
 
 def act_again(client, state):
@@ -141,28 +189,48 @@ def test_each_worker_has_its_metrics(served, client_of, example):
         assert counted == answered(served, number)
 
 
-def test_a_killed_worker_is_replaced(served, client_of, example):
-    """Its clients are answered by the other worker, without a new client."""
-    client = client_of(1)
-    client.act(example.state)
-    killed = served.worker(1)
-    before = answered(served, 0)
-    killed.kill()
-    killed.wait(30)
-    act_again(client, example.state)
-    assert answered(served, 0) > before
-    eventually(lambda: served.worker(1))
-    assert answered(served, 1) == 0
-    assert "The worker 1 was killed by SIGKILL. Restarting it." in served.log.read_text()
+@pytest.mark.parametrize("number", range(WORKERS))
+def test_a_killed_worker_is_replaced(served, client_of, example, number, exit_code_of, capsys):
+    """Meanwhile the other worker answers a connected and a new client, whose orders both begin with
+    the killed one.
+    """
+    connected = client_of(number)
+    connected.act(example.state)
+    other = 1 - number
+    with without_worker(served, number):
+        act_again(connected, example.state)
+        before = answered(served, other)
+        client_of(number).act(example.state)
+        assert answered(served, other) == before + 1
+        assert exit_code_of(["query", "--health", "--connect", served.endpoint]) == 0
+        health = json.loads(capsys.readouterr().out)
+        assert health["workers_ready"] == WORKERS - 1
+    eventually(lambda: served.worker(number))
+    line = f"The worker {number} was killed by SIGKILL. Restarting it."
+    assert line in served.log.read_text()
 
 
-def test_a_client_continues_if_the_first_worker_is_killed(served, client_of, example):
-    client = client_of(0)
-    client.act(example.state)
-    killed = served.worker(0)
-    killed.kill()
-    killed.wait(30)
-    act_again(client, example.state)
+def test_workers_with_certificates_follow_a_learner(tmp_path):
+    policy = dataclasses.replace(task.policy(), version=1)
+    message = policy.to_message()
+    certs = tmp_path / "certs"
+    create_authority(certs, run="safe")
+    for role in ("learner", "server", "client"):
+        issue(certs, role)
+    learner = local_url()
+    with urls.listen(learner, "learner", certs=certs) as transport:
+        hub, _ = learner_hub(
+            transport, "safe", schema=policy.spec.schema, run_id=message.meta["run_id"]
+        )
+        hub.publish_weights(message, 1)
+        with serving(tmp_path, connect=learner, run="safe", certs=certs) as server:
+            for number in range(WORKERS):
+                eventually(lambda n=number: health_of_worker(server, n, certs=certs))
+
+            def servers():
+                return [role for role in hub.status()["roles"] if role["role"] == "server"]
+
+            eventually(lambda: len(servers()) == WORKERS)
 
 
 def test_ctrl_c_ends_all_workers(tmp_path):
@@ -181,3 +249,10 @@ def test_bad_input_of_workers_ends_the_server(tmp_path):
     with serving(tmp_path, policy=policy) as server:
         assert server.process.wait(WAIT_S) == 2
     assert "damaged.safetensors" in server.log.read_text()
+
+
+def test_workers_end_if_the_learner_is_missing(tmp_path):
+    learner = local_url()
+    with serving(tmp_path, connect=learner, patience=0.1) as server:
+        assert server.process.wait(WAIT_S) == TransportError.exit_code
+    assert learner in server.log.read_text()

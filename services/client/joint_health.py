@@ -1,12 +1,13 @@
-"""Workers of a policy server: their endpoints, and their joint health."""
+"""Joint health of the workers of a policy server."""
 
+import contextlib
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from congrasp.common.errors import TransportError
-from congrasp.common.transport.ports import shifted
-from congrasp.services.client.policy_client import WORKERS, PolicyClient
+from congrasp.services.client.policy_client import PolicyClient
+from congrasp.services.client.worker_endpoints import WORKER, worker_endpoints
 
 _SUMS = ("queue", "queue_limit", "states_per_second", "answered")
 """Entries of a server's health that add up."""
@@ -27,32 +28,35 @@ def joint_health(
       certs: folder of a client's certificate.
 
     Raises:
-      TransportError: the first worker does not respond.
+      TransportError: neither the first worker nor the second responds.
     """
-
-    def health_of(endpoint: str) -> dict[str, Any]:
-        with PolicyClient(endpoint, run, timeout=timeout, wait=timeout, certs=certs) as client:
-            return client.health()
-
-    first = health_of(connect)
-    workers = first.get(WORKERS, 1)
-    if workers == 1:
+    with PolicyClient(connect, run, timeout=timeout, wait=timeout, certs=certs) as client:
+        first = client.health()
+        endpoints = worker_endpoints(client.endpoint, first)
+    if len(endpoints) == 1:
         return first
+    number_of_first = first.get(WORKER, 0)
     healths = [first]
-    for worker in range(1, workers):
-        try:
-            healths.append(health_of(shifted(connect, worker)))
-        except TransportError:
+    for number, endpoint in enumerate(endpoints):
+        if number == number_of_first:
             continue
+        with (
+            contextlib.suppress(TransportError),
+            PolicyClient(endpoint, run, timeout=timeout, wait=timeout, certs=certs) as client,
+        ):
+            if client.endpoint == endpoint:  # and not the second worker, in place of the first
+                healths.append(client.health())
     return _joined(healths)
 
 
 def _joined(healths: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Joins the health of the workers that respond."""
     ready = [health for health in healths if health["ready"]]
+    example = ready[0] if ready else healths[0]
+    joined = {**example, "workers_ready": len(ready)}
+    joined.pop(WORKER, None)
     if not ready:
-        return {**healths[0], "workers_ready": 0}
-    joined = {**ready[0], "workers_ready": len(ready)}
+        return joined
     for name in _SUMS:
         joined[name] = sum(health[name] for health in ready)
     joined["version"] = min(health["version"] for health in ready)
