@@ -119,7 +119,8 @@ class Serve:
     def _serve(self) -> int:
         """Serves in this process until a signal."""
         starting = contextlib.ExitStack()
-        starting.enter_context(announce_progress("Loading and compiling the policy"))
+        activity = "Loading and compiling the policy"
+        starting.enter_context(announce_progress(lambda: activity))
         # Waking a thread costs more than it saves in one policy's inference. So JAX has no pool of
         # threads, whose size it reads at its import, and computes in the calling thread (below).
         os.environ.setdefault("NPROC", "1")
@@ -139,8 +140,11 @@ class Serve:
             contextlib.ExitStack() as stack,
         ):
             if self.connect:
+                compiling = activity
+                activity = f"Waiting for the policy of the learner at {self.connect}"
                 with on_signal() as stop:
                     source = self._source_of_run(stack, stop)
+                activity = compiling
                 if source is None:
                     log("info", f"The server ends: {stop.reason}.")
                     return stop.exit_code

@@ -20,6 +20,9 @@ from congrasp.services.client.worker_endpoints import WORKER, WORKERS, worker_en
 
 _RETRY_PAUSE_S = 0.2
 """Time between two attempts to reach a server that does not respond or is starting."""
+_HEALTH_INTERVAL_S = 0.02
+"""Time between two queries of a server's health: one with certificates drops a query that follows
+another one of the same connection within 10 ms (`LIMITS` of `common.transport.security`)."""
 _REPORT_AFTER_S = 2.0
 """Time after which a wait is reported."""
 _STARTING_S = 3.0
@@ -101,6 +104,7 @@ class PolicyClient(EpisodePolicy):
         self._timeout_s = timeout
         self._wait_s = wait
         self._has_metadata = False  # True once the server has sent its metadata
+        self._health_queried_at = 0.0
         self._act_key = self._keys.act_for(urls.name_on_wire(secrets.token_hex(4), certs, "client"))
         self._transport = self._connect_to_server()
         self._connected_at = time.monotonic()
@@ -116,10 +120,20 @@ class PolicyClient(EpisodePolicy):
         """
         return self._health_at(self._transport)
 
-    def _health_at(self, transport: Transport) -> dict[str, object]:
-        """Returns the health of the server at the other end of a connection."""
-        reply = transport.query(self._keys.health, Message({}, {}), timeout=self._timeout_s)
-        return dict(reply.meta)
+    def _health_at(self, transport: Transport, **question: bool) -> dict[str, Any]:
+        """Returns the health of the server at the other end of a connection.
+
+        Args:
+          transport: the connection.
+          question: what else the server is asked for: `metadata=True`.
+        """
+        since_last_s = time.monotonic() - self._health_queried_at
+        time.sleep(max(0.0, _HEALTH_INTERVAL_S - since_last_s))
+        query = Message({}, question)
+        try:
+            return dict(transport.query(self._keys.health, query, timeout=self._timeout_s).meta)
+        finally:
+            self._health_queried_at = time.monotonic()
 
     def wait_until_ready(self) -> dict[str, Any]:
         """Returns the health of the server, or of one of its workers; waits for one that is
@@ -182,9 +196,7 @@ class PolicyClient(EpisodePolicy):
           RefusedError: the server is older than this client, or serves another hand.
           TransportError: there is no response.
         """
-        query = Message({}, {"metadata": True})
-        reply = self._transport.query(self._keys.health, query, timeout=self._timeout_s)
-        metadata = dict(reply.meta)
+        metadata = self._health_at(self._transport, metadata=True)
         if "query" not in metadata:
             raise RefusedError(
                 "The server does not describe its queries.",
@@ -235,7 +247,6 @@ class PolicyClient(EpisodePolicy):
             if self._health_at(transport).get(WORKER) == 1:
                 stack.pop_all()
                 self._endpoint = endpoint
-                time.sleep(_RETRY_PAUSE_S)  # servers with certificates drop queries in a row
                 return transport
         return None
 

@@ -9,12 +9,14 @@ from congrasp.common.errors import RefusedError, TransportError
 from congrasp.common.hands import get_hand
 from congrasp.common.request import GraspRequest
 from congrasp.common.task.config import TaskConfig
+from congrasp.common.transport import urls
 from congrasp.common.transport.keys import Keys, below
-from congrasp.common.transport.ports import free_port, shifted
+from congrasp.common.transport.ports import free_port, local_url, shifted
 from congrasp.common.transport.zenoh_transport import ZenohTransport
 from congrasp.common.wire.codec import Message
 from congrasp.services.client.policy_client import PolicyClient
 from congrasp.services.client.worker_endpoints import worker_endpoints
+from congrasp.services.ops.certificates import create_authority, issue
 from congrasp.services.serve.inference import Inference, PolicyFunction
 from tests.waits import eventually
 
@@ -166,6 +168,20 @@ def test_another_server_on_the_next_port_is_not_used(endpoint):
         PolicyClient(endpoint, wait=0.5)
     assert server.described == 1
     server.close()
+
+
+def test_queries_of_health_in_a_row_reach_a_server_with_certificates(tmp_path):
+    """Such a server drops queries of the same connection within 10 ms."""
+    certs = tmp_path / "certs"
+    create_authority(certs, run="safe")
+    issue(certs, "server")
+    issue(certs, "client")
+    endpoint = local_url()
+    with urls.listen(endpoint, "server", certs=certs) as transport:
+        transport.serve(Keys("policy").health, lambda key, request: Message({}, {"ready": True}))
+        with PolicyClient(endpoint, certs=certs, wait=30.0) as client:
+            for _ in range(10):
+                assert client.health() == {"ready": True}
 
 
 def test_a_missing_server_is_one_line(endpoint):
