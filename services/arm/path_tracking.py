@@ -97,9 +97,12 @@ def follow(robot: Robot, path: Path, rng: np.random.Generator) -> Track:
       rng: generator of the initial postures.
 
     Raises:
-      Infeasible: no start leads to the path's end; the message names the limit that the start with
-        the longest way violates.
+      Infeasible: the path leads out of the arm's reach, or no start leads to its end; the message
+        names the limit that the start with the longest way violates.
     """
+    distance = float(np.linalg.norm(path.position, axis=1).max())
+    if distance > robot.wrist_reach + POSITION_TOLERANCE_M:
+        raise Infeasible("the reach")
     solver = _Solver(robot, path)
     failures = []
     for start in solver.starts(rng):

@@ -114,8 +114,21 @@ class Robot:
 
     @property
     def reach(self) -> float:
-        """Upper bound on the distance of a point of arm and hand from the base, m: the offsets of
-        the bodies and joints, added up as if all of them were stretched out in one line.
+        """Upper bound on the distance of a point of arm and hand from the base, m."""
+        model = self.model
+        extents = np.linalg.norm(model.geom_pos, axis=1) + model.geom_rbound
+        of_robot = [model.body(body).name not in _SCENE for body in model.geom_bodyid]
+        return float((self._body_reaches()[model.geom_bodyid] + extents)[of_robot].max())
+
+    @property
+    def wrist_reach(self) -> float:
+        """Upper bound on the distance of the wrist frame from the base, m."""
+        return float(self._body_reaches()[self.model.body(self.palm).id])
+
+    def _body_reaches(self) -> np.ndarray:
+        """Upper bounds (bodies,) on the distance of each body's frame from the base, m: the offsets
+        of the bodies and joints, added up as if all of them were stretched out in one line; 0 for
+        the table and the object.
         """
         model = self.model
         lengths = np.linalg.norm(model.body_pos, axis=1)
@@ -125,13 +138,11 @@ class Robot:
             if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
                 limits = model.jnt_range[joint] if model.jnt_limited[joint] else np.inf
                 lengths[body] += np.abs(limits).max()
-        farthest = np.zeros(model.nbody)
+        reaches = np.zeros(model.nbody)
         for body in range(1, model.nbody):
             if model.body(body).name not in _SCENE:
-                farthest[body] = farthest[model.body_parentid[body]] + lengths[body]
-        extents = np.linalg.norm(model.geom_pos, axis=1) + model.geom_rbound
-        of_robot = [model.body(body).name not in _SCENE for body in model.geom_bodyid]
-        return float((farthest[model.geom_bodyid] + extents)[of_robot].max())
+                reaches[body] = reaches[model.body_parentid[body]] + lengths[body]
+        return reaches
 
 
 def default_mount(hand: Hand) -> Pose:

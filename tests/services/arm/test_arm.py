@@ -151,6 +151,15 @@ def test_a_wrist_beyond_the_arm_names_the_reach(robot):
         follow(robot, path, np.random.default_rng(0))
 
 
+def test_a_path_out_of_reach_is_refused_at_once(robot, monkeypatch):
+    """Its first pose is within reach; no inverse kinematics is computed."""
+    path = path_of(robot, swing())
+    path.position[-1] *= (robot.wrist_reach + 0.01) / np.linalg.norm(path.position[-1])
+    monkeypatch.setattr("mink.solve_ik", None)
+    with pytest.raises(Infeasible, match=r"^the reach$"):
+        follow(robot, path, np.random.default_rng(0))
+
+
 def test_a_motion_that_is_too_fast_names_the_joint(robot):
     with pytest.raises(Infeasible, match=r"the (speed|acceleration) of (j\d|the wrist)"):
         follow(robot, path_of(robot, swing(0.15)), np.random.default_rng(0))
@@ -420,12 +429,16 @@ def test_no_point_of_arm_and_hand_is_beyond_the_reach(robot):
         model.body(body).name not in ("grasp_table", "grasp_object") for body in model.geom_bodyid
     ]
     farthest = 0.0
+    farthest_wrist = 0.0
     for _ in range(200):
         data.qpos[:] = rng.uniform(-np.pi, np.pi, model.nq)
         mujoco.mj_kinematics(model, data)
         distances = np.linalg.norm(data.geom_xpos, axis=1) + model.geom_rbound
         farthest = max(farthest, distances[of_robot].max())
+        wrist = np.linalg.norm(data.body(robot.palm).xpos)
+        farthest_wrist = max(farthest_wrist, wrist)
     assert 0.5 * robot.reach < farthest <= robot.reach
+    assert 0.5 * robot.wrist_reach < farthest_wrist <= robot.wrist_reach
 
 
 def test_a_base_beyond_the_reach_is_refused_before_the_simulation(block, folder):
