@@ -63,7 +63,8 @@ def call_confined(
       folder: an empty folder, or one with arrays for the function; it may write others.
       options: further arguments, as JSON takes them.
       limits: limits of the child.
-      packages: packages that the function uses, imported before it is called.
+      packages: packages that the function uses, imported before its module: a missing one fails
+        soonest.
       on_wait: called twice a second while the child runs; what it raises ends the child.
 
     Raises:
@@ -134,10 +135,10 @@ def _child(
     called: str, folder: str, memory: str, seconds: str, parent: str, *packages: str
 ) -> None:
     """Calls the function; ends at a limit, or when the parent is gone."""
-    module, _, name = called.partition(":")
-    function = getattr(importlib.import_module(module), name)
     for package in packages:
         importlib.import_module(package)
+    module, _, name = called.partition(":")
+    function = getattr(importlib.import_module(module), name)
     options = json.load(sys.stdin)
     end_with(int(parent))
     limit_this_process(int(memory), float(seconds))
