@@ -13,7 +13,7 @@ from congrasp.common.policy import bundle as bundles
 from tests.base_install import steady_server
 from tests.benchmarks.robot import SEED, Rig
 from tests.examples import example
-from tests.task import HAND, TASK, policy
+from tests.task import HAND, TASK, heading_policy
 
 SECONDS = 120.0
 """That a server has to start."""
@@ -46,7 +46,7 @@ def test_the_node_follows_a_server_and_opens_without_one(robot, tmp_path):
 
 
 def test_joints_stay_in_limits_while_the_server_restarts(loop, robot, tmp_path):
-    bundles.save(policy(), tmp_path / "policy.safetensors")
+    bundles.save(heading_policy(), tmp_path / "policy.safetensors")
     limits = congrasp.JointLimits.of_hand(HAND)
     robot.reset()
     server = loop.Server(tmp_path / "policy.safetensors")

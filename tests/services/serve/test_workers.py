@@ -76,7 +76,7 @@ def serving(folder, **options) -> Iterator[Served]:
 def server(tmp_path_factory):
     folder = tmp_path_factory.mktemp("policy")
     path = folder / "policy.safetensors"
-    bundles.save(task.policy(), path)
+    bundles.save(task.heading_policy(), path)
     with serving(folder, policy=path) as server:
         yield server
 
