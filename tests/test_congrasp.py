@@ -14,6 +14,7 @@ import trimesh
 import congrasp
 from tests.base_install import run_in_base_install, steady_server
 from tests.children import python
+from tests.short_grasps import short_pushes
 
 CLIENT = """
 import congrasp
@@ -97,7 +98,8 @@ def test_a_grasp_is_one_call_and_its_motion_a_file(tmp_path, monkeypatch, paper_
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     mesh = tmp_path / "block.stl"
     trimesh.creation.box((0.05, 0.06, 0.14)).export(mesh)
-    grasp = congrasp.grasp(mesh, heading=(0, 0, -1), attempts=4)
+    with short_pushes():
+        grasp = congrasp.grasp(mesh, heading=(0, 0, -1), attempts=4)
     assert isinstance(grasp, congrasp.Grasp)
     assert 1 <= grasp.held <= grasp.attempts
     assert grasp.success

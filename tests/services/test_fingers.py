@@ -30,6 +30,7 @@ from congrasp.services.studio.state import Studio
 from congrasp.services.train.command import untrained
 from tests.printed import errors
 from tests.queries import packed
+from tests.short_grasps import short_pushes
 from tests.task import CONFIG, HAND, TASK
 from tests.task import policy as make_policy
 
@@ -122,7 +123,9 @@ def test_a_grasp_with_two_fingers_and_a_force_limit(
     policy: PolicyBundle, tmp_path: pathlib.Path
 ) -> None:
     grasper = Grasper(policy, attempts=2, rounds=1, phases=Phases(hold=0.25), threads=1)
-    grasp = grasper.grasp(MUG, read_request(MUG, HAND, 15, fingers=("thumb", "index"), force="3"))
+    request = read_request(MUG, HAND, 15, fingers=("thumb", "index"), force="3")
+    with short_pushes():
+        grasp = grasper.grasp(MUG, request)
     grasper.close()
     assert grasp.motion.constraints == ("heading", "fingers", "force")
     assert "fingers_ratio" in grasp.facts()

@@ -46,8 +46,16 @@ from congrasp.services.grasp.result import Result
 from congrasp.services.record.reader import read_episodes
 from tests.episodes import episode
 from tests.services.conftest import quick_imports
+from tests.short_grasps import short_pushes
 
 SIDES = (0.05, 0.06, 0.14)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _short_pushes():
+    """No test depends on the pushes after the hold, which take most of an attempt."""
+    with short_pushes():
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -353,12 +361,12 @@ def test_exit_codes(tmp_path, capsys, monkeypatch, fake_grasps):
     assert "--heading is 'up there', not 3 numbers" in capsys.readouterr().err
 
 
-def test_pictures_of_import_and_grasp(tmp_path, monkeypatch, fake_grasps):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+def test_pictures_of_import_and_grasp(tmp_path, fake_grasps):
     path = meshes(tmp_path / "things", "a") / "a.stl"
-    assert command(path, "--out", tmp_path / "out") == 0
+    options = ["--out", str(tmp_path / "out"), "--cache-dir", str(tmp_path / "cache")]
+    assert command(path, *options) == 0
     for _ in range(2):
-        assert load("grasp")([str(path), "--out", str(tmp_path / "out")])() == 0
+        assert load("grasp")([str(path), *options])() == 0
     assert fake_grasps == ["a", "a"]  # without its pictures it was not finished
     assert Image.open(tmp_path / "out" / "a" / PORTRAIT).size == (1280, 720)
     for name, columns in ((OBJECT, 3), (PICTURE, 4)):
