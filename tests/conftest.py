@@ -122,6 +122,27 @@ def paper_policy(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
 
 
 @pytest.fixture(scope="session")
+def short_policy(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """File of an untrained policy of the smallest task, whose programs compile soonest."""
+    from congrasp.common.config import NetworkConfig, RunConfig
+    from congrasp.common.policy import bundle
+    from congrasp.common.task.config import TaskConfig
+    from congrasp.services.train.command import untrained
+
+    task = TaskConfig(
+        constraints=("heading",),
+        approach_steps=3,
+        hold_steps=2,
+        hold_steps_max=2,
+        surface_points=64,
+    )
+    file = tmp_path_factory.mktemp("policies") / "short.safetensors"
+    network = NetworkConfig(hidden=(4,), encoder=2)
+    bundle.save(untrained(RunConfig(task=task, network=network)), file)
+    return file
+
+
+@pytest.fixture(scope="session")
 def mano(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     """A file of MANO's layout."""
     from tests.mano_file import mano_pickle

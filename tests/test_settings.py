@@ -28,27 +28,6 @@ def results(
     return done.stdout.splitlines()
 
 
-@pytest.fixture(scope="module")
-def short_policy(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
-    """File of a policy of the smallest task, whose programs compile soonest."""
-    from congrasp.common.config import NetworkConfig, RunConfig
-    from congrasp.common.policy import bundle
-    from congrasp.common.task.config import TaskConfig
-    from congrasp.services.train.command import untrained
-
-    task = TaskConfig(
-        constraints=("heading",),
-        approach_steps=3,
-        hold_steps=2,
-        hold_steps_max=2,
-        surface_points=64,
-    )
-    config = RunConfig(task=task, network=NetworkConfig(hidden=(4,), encoder=2))
-    file = tmp_path_factory.mktemp("policies") / "short.safetensors"
-    bundle.save(untrained(config), file)
-    return file
-
-
 def test_entries_ignore_all_settings_at_once(short_policy):
     """The results without them are those of the same process, whose programs are compiled once."""
     lines = results(short_policy, "everything", "plain", environment=ENVIRONMENT)

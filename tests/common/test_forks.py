@@ -104,13 +104,13 @@ LOADED = "policy = congrasp.load_policy({policy!r})\n"
         pytest.param(LOADED + "call = lambda: policy.act({{}})", id="act of an open policy"),
     ],
 )
-def test_a_fork_is_refused(before, listener, tmp_path, paper_policy):
+def test_a_fork_is_refused(before, listener, tmp_path, short_policy):
     """By a module of the standard library, and by the system's call from the same process."""
     forks = ["in_child('fork', call)"]
     # JAX crashes at the end of a forked interpreter that has compiled programs
     if "policy = " not in before:
         forks.append("in_fork(call)")
-    body = "\n".join([before.format(policy=str(paper_policy)), *forks])
+    body = "\n".join([before.format(policy=str(short_policy)), *forks])
     lines = lines_of(tmp_path, body)
     assert len(lines) == 2 * len(forks)
     for answer in lines[::2]:
