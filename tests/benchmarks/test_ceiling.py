@@ -9,7 +9,7 @@ from tests import task as suite
 from tests.benchmarks import ceiling_search
 from tests.benchmarks.ceiling_counts import Lost, by_object, by_row, counts_of, table
 from tests.benchmarks.ceiling_rollouts import PHASES, Simulator, Trials
-from tests.task import BATCH, HAND, OBJECTS, TASK
+from tests.task import HAND, OBJECTS, TASK
 
 EPISODES = [
     *[("heading", "mug"), ("heading", "plate"), ("heading", "plate")],
@@ -78,15 +78,17 @@ def test_counts_by_row_and_ceiling():
 
 
 def test_unmodified_trials_are_the_evaluation():
+    # With as many environments as the tests of the evaluation, whose programs are compiled already
+    batch = len(OBJECTS)
     experiment = Experiment(
-        suite.policy(), OBJECTS, suite.bank(), episodes=BATCH, batch=BATCH, hold=TASK.hold_steps
+        suite.policy(), OBJECTS, suite.bank(), episodes=batch, batch=batch, hold=TASK.hold_steps
     )
     (result,) = experiment.run([Variation()])
     plan = experiment.plan(Variation())
     ((begun, count),) = batches(
-        HAND, experiment.task, experiment.bank, plan, experiment.seed, BATCH
+        HAND, experiment.task, experiment.bank, plan, experiment.seed, batch
     )
-    with Simulator(experiment, BATCH) as simulator:
+    with Simulator(experiment, batch) as simulator:
         outcomes = simulator.run(begun, simulator.unmodified(count))
         offset = np.full((3, len(PHASES), simulator.action_size), 0.5)
         trials = Trials(np.zeros(3, int), offset, np.array([0.0, 0.0, 0.3]))

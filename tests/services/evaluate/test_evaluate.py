@@ -60,6 +60,15 @@ def experiment():
     )
 
 
+@pytest.fixture(scope="module")
+def alone(experiment):
+    """Results of two rows, each simulated without the other."""
+    results = {}
+    for constraint in ("affordance", "heading"):
+        (results[constraint],) = experiment.run([Variation(constraint)])
+    return results
+
+
 def test_references_are_grasps_and_made_once(experiment, monkeypatch):
     policy = references.reference_policy(task.policy())[0]
     progress = []
@@ -188,20 +197,18 @@ def test_shares_of_the_rules_for_headings(experiment):
     ) == pytest.approx(unchanged)
 
 
-def test_rows_are_independent_and_kept_episodes_are_drawn(experiment):
+def test_rows_are_independent_and_kept_episodes_are_drawn(experiment, alone):
     """Equal to the last digit, whatever was simulated before it, and whether every step is
     recorded.
     """
-    variations = [Variation("affordance"), Variation()]
-    among = experiment.run(variations, keep=True)
-    for variation, result in zip(variations, among, strict=True):
-        (alone,) = experiment.run([variation])
+    among = experiment.run([Variation("affordance"), Variation()], keep=True)
+    for expected, result in zip(alone.values(), among, strict=True):
         for key, column in result.sample.values.items():
             np.testing.assert_array_equal(
-                alone.sample.values[key], column, err_msg=f"{variation}: {key}"
+                expected.sample.values[key], column, err_msg=f"{result.variation}: {key}"
             )
-        assert alone.row.to_json() == result.row.to_json()
-        assert not alone.examples(1, 1)
+        assert expected.row.to_json() == result.row.to_json()
+        assert not expected.examples(1, 1)
     heading = among[1]
     assert len(heading.held) == heading.sample.values["held"].sum() == EPISODES - len(heading.lost)
     ((name, sheet, causes),) = failure_sheets(experiment, [heading], successes=2, failures=2)
@@ -211,16 +218,15 @@ def test_rows_are_independent_and_kept_episodes_are_drawn(experiment):
     assert sheet.shape[1] > 5 * 300
 
 
-def test_rows_in_common_batches_are_the_same_episodes(experiment, monkeypatch):
+def test_rows_in_common_batches_are_the_same_episodes(experiment, alone, monkeypatch):
     """As engines on a device run them."""
-    variations = [
-        Variation("affordance"),
+    changed = [
         Center(),
-        Variation(),
         Load(label="heavy", mass=(2, 2)),
         Load(label="light", mass=(0.02, 0.02)),
     ]
-    alone = experiment.run(variations)
+    center, heavy, light = experiment.run(changed)
+    separate = [alone["affordance"], center, alone["heading"], heavy, light]
     monkeypatch.setitem(ENGINES, "native", ENGINES["native"]._replace(on_device=True))
     batches = []
     run = Episodes.run
@@ -232,18 +238,18 @@ def test_rows_in_common_batches_are_the_same_episodes(experiment, monkeypatch):
     monkeypatch.setattr(Episodes, "run", counted)
     progress = []
     tracked = dataclasses.replace(experiment, track=lambda label, total: progress.append)
-    together = tracked.run(variations)
-    episodes = sum(result.row.episodes for result in alone)
+    together = tracked.run([result.variation for result in separate])
+    episodes = sum(result.row.episodes for result in separate)
     assert len(batches) == math.ceil(episodes / EPISODES)
     assert progress[-1] == episodes
     assert progress == sorted(progress)
-    for expected, result in zip(alone, together, strict=True):
+    for expected, result in zip(separate, together, strict=True):
         for key, column in expected.sample.values.items():
             np.testing.assert_array_equal(result.sample.values[key], column, err_msg=key)
         assert result.row.to_json() == expected.row.to_json()
 
 
-def test_a_stopped_evaluation_resumes_at_its_current_row(experiment, tmp_path, monkeypatch):
+def test_a_stopped_evaluation_resumes_at_its_current_row(experiment, alone, tmp_path, monkeypatch):
     variations = [Variation("affordance"), Variation()]
     simulated = []
     sample = Experiment.sample
@@ -259,9 +265,9 @@ def test_a_stopped_evaluation_resumes_at_its_current_row(experiment, tmp_path, m
         experiment.run(variations, stored=tmp_path)
     rows = [result.row.to_json() for result in experiment.run(variations, stored=tmp_path)]
     assert simulated == ["affordance", "heading", "heading"]
-    assert rows == [result.row.to_json() for result in experiment.run(variations)]
+    assert rows == [result.row.to_json() for result in alone.values()]
     dataclasses.replace(experiment, seed=1).run(variations[:1], stored=tmp_path)
-    assert simulated[-3:] == ["affordance", "heading", "affordance"]  # other settings: anew
+    assert simulated[3:] == ["affordance"]  # with other settings again
 
 
 def test_rows_of_fingers_and_of_a_force_limit(experiment):
