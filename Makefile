@@ -74,7 +74,9 @@ $(VENV)/.$(EXTRA): pyproject.toml constraints.txt
 	  { echo "Python's venv module does not work here. On Debian or Ubuntu: apt-get install python3-venv" >&2; exit 2; }
 	@echo "Installing congrasp[$(EXTRA)] into $(VENV): some minutes the first time (dev: about 3 GB)"
 	$(PIP) install --quiet --upgrade --constraint $(CONSTRAINTS) pip
-	$(PIP) install --quiet --no-compile --constraint $(CONSTRAINTS) --editable '.[$(EXTRA)]'
+	@# setuptools warns of folders with the package's name: the only one is the package
+	PYTHONWARNINGS='ignore:Editable installation' \
+	  $(PIP) install --quiet --no-compile --constraint $(CONSTRAINTS) --editable '.[$(EXTRA)]'
 	@# pip would compile on one core
 	@$(VENV)/bin/python -m compileall -q -j 0 -x '/(tests?|OpenGL)/' $(VENV)/lib >/dev/null 2>&1 || true
 	@touch $@
