@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from congrasp.services.serve.sources import Source
 
 
+_COMPILING = "Loading and compiling the policy"
+
+
 @dataclasses.dataclass(frozen=True)
 class Serve:
     """Answer live queries with a policy file, or with the newest policy of a run while it trains.
@@ -119,7 +122,7 @@ class Serve:
     def _serve(self) -> int:
         """Serves in this process until a signal."""
         starting = contextlib.ExitStack()
-        activity = "Loading and compiling the policy"
+        activity = _COMPILING
         starting.enter_context(announce_progress(lambda: activity))
         # Waking a thread costs more than it saves in one policy's inference. So JAX has no pool of
         # threads, whose size it reads at its import, and computes in the calling thread (below).
@@ -140,11 +143,10 @@ class Serve:
             contextlib.ExitStack() as stack,
         ):
             if self.connect:
-                compiling = activity
                 activity = f"Waiting for the policy of the learner at {self.connect}"
                 with on_signal() as stop:
                     source = self._source_of_run(stack, stop)
-                activity = compiling
+                activity = _COMPILING
                 if source is None:
                     log("info", f"The server ends: {stop.reason}.")
                     return stop.exit_code
